@@ -75,13 +75,13 @@ check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
-	MYPYPATH=tests:scripts:bench $(BIN)/mypy bench/*.py examples/*.py examples/controllers/*.py
 	$(BIN)/python scripts/check_vocabulary.py
 
 gen: .venv/dev ## generate code and documentation tables from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
 	$(BIN)/python scripts/wire_contract.py
 	$(BIN)/python scripts/generate_configuration.py
+	$(BIN)/python scripts/generate_json_schemas.py
 	$(BIN)/hilrig registers --markdown > docs/registers.md
 	$(BIN)/python scripts/generate_conformance.py > docs/modbus-conformance.md
 	$(BIN)/python scripts/draw_grading.py

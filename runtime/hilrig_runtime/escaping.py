@@ -8,6 +8,8 @@ from html import escape
 from typing import Final
 
 _FORMULA_BEGINNINGS: Final = ("=", "+", "-", "@", "\t", "\r")
+_JOINERS: Final = "\u200c\u200d"
+"""Format characters that are part of words, as in Persian and Sinhala names."""
 
 
 def printable(text: str, keep: str = "") -> str:
@@ -15,7 +17,9 @@ def printable(text: str, keep: str = "") -> str:
     if text.isprintable():
         return text
     return "".join(
-        letter if letter.isprintable() or letter in keep or (letter.isspace() and letter > "\x9f") else _escape(letter)
+        letter
+        if letter.isprintable() or letter in keep or letter in _JOINERS or (letter.isspace() and letter > "\x9f")
+        else _escape(letter)
         for letter in text
     )
 

@@ -1,10 +1,10 @@
-"""Every file, test, target and identifier of CONTRIBUTING.md exists; its list of files with four joints is complete."""
+"""What CONTRIBUTING.md and the recipes name exists; the list of files with four joints is complete."""
 
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+PAGE = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("CONTRIBUTING.md", "docs/recipes.md"))
 PACKAGES = {path.name: path.parent for path in [*ROOT.glob("*/hilrig_*"), *ROOT.glob("*/*/hilrig_*")]}
 TERMS = set(re.findall(r"`([^`\n]+)`", PAGE))
 FOUR_JOINTS = re.compile(
@@ -15,7 +15,7 @@ NOT_JOINTS = re.compile(r"quaternion|rgba|figsize|len\((?:parts|request)\)", re.
 
 
 def place(name: str) -> Path:
-    """Return the file or folder of a name in CONTRIBUTING.md."""
+    """Return the file or folder of a name in these pages."""
     return PACKAGES.get(name.partition("/")[0], ROOT) / name
 
 

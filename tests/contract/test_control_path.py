@@ -1,4 +1,4 @@
-"""ARCHITECTURE.md lists the control path; the code calls the listed functions in this order, and no others."""
+"""docs/control-path.md lists the control path; the code calls the listed functions in this order, and no others."""
 
 import ast
 import asyncio
@@ -33,7 +33,7 @@ from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
 from support.plc import Plc
 
-PAGE = (Path(__file__).parents[2] / "ARCHITECTURE.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs/control-path.md").read_text(encoding="utf-8")
 HOP = re.compile(r"^(\d+)\. `([\w.]+)`(?:, through `(\w+)`)?(?:, called by (\d+|[a-z ]+))?: ")
 STEP_NS = 20_000_000
 WORDS = bytes(range(1, 9))
@@ -84,7 +84,7 @@ def resolve(name: str) -> FunctionType | None:
 def read_paths() -> list[list[Hop]]:
     """Return the lists of the page."""
     paths: list[list[Hop]] = []
-    for line in PAGE.partition("\n## Control path\n")[2].partition("\n## ")[0].splitlines():
+    for line in PAGE.splitlines():
         if re.match(r"\d", line):
             match = HOP.match(line)
             assert match, line

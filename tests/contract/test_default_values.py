@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from pydantic import BaseModel
 
 from hilrig_cli.commands.impair import impair
 from hilrig_cli.commands.jitter import jitter
@@ -62,8 +63,8 @@ DOCUMENTED = [
     ("docs/operations.md", r"^\| (\d+), \d+, … \| edge: one port per rig", [(PORT, 1)]),
     ("docs/operations.md", r"^\| (\d+), \d+, … \| edge: the same with TLS", [(TLS_PORT, 1)]),
     ("docs/operations.md", r"^\| (\d+), \d+, \d+ \| simulation, edge, recorder", [(BUS_PORT, 1)]),
-    ("docs/operations.md", r"`sim\.command_timeout_ms` \((\d+) ms\)", [("sim.command_timeout_ms", 1)]),
-    ("docs/operations.md", r"the bus: can't listen on 127\.0\.0\.1:(\d+)", [(BUS_PORT, 1)]),
+    ("docs/several-hosts.md", r"`sim\.command_timeout_ms` \((\d+) ms\)", [("sim.command_timeout_ms", 1)]),
+    ("docs/troubleshooting.md", r"the bus: can't listen on 127\.0\.0\.1:(\d+)", [(BUS_PORT, 1)]),
     *(
         (page, r"to `rig64`,? at ports (\d+) to", [(PORT, 1)])
         for page in ("docs/operations.md", "docs/configuration.md")
@@ -90,10 +91,14 @@ DOCUMENTED = [
         [(f"arm.friction.{index}", 1) for index in range(4)],
     ),
     ("docs/model.md", r"^\| J4 .* \| (\S+) kg·m²", [("arm.j4_kgm2", 1)]),
-    ("docs/model.md", r"\*\*m3 and b3\*\* are (\S+) kg and (\S+) N", [("arm.masses_kg.2", 1), ("arm.friction.2", 1)]),
-    ("docs/model.md", r"top is at z = (\S+) mm", [("scene.table.height_mm", 1)]),
     (
-        "docs/model.md",
+        "docs/model-decisions.md",
+        r"\*\*m3 and b3\*\* are (\S+) kg and (\S+) N",
+        [("arm.masses_kg.2", 1), ("arm.friction.2", 1)],
+    ),
+    ("docs/model-decisions.md", r"top is at z = (\S+) mm", [("scene.table.height_mm", 1)]),
+    (
+        "docs/model-decisions.md",
         r"within (\d+) mm sideways and (\d+) mm in height",
         [("scene.magnet.reach_mm", 1), ("scene.magnet.gap_mm", 1)],
     ),
@@ -119,7 +124,7 @@ CONSTANTS = [
     ("docs/adr/0044-commands-are-throttled-with-a-deadline.md", r"beyond (\S+) ms before", DEADLINE_MARGIN_NS / 1e6),
     ("docs/modbus-conformance.md", r"incomplete after (\S+) s is aborted", HANDSHAKE_TIMEOUT_S),
     ("docs/recordings.md", r"chunks compressed with (\w+)", COMPRESSION),
-    ("CONTRIBUTING.md", r"`HANDSHAKE_TIMEOUT_S` \| (\S+) s", HANDSHAKE_TIMEOUT_S),
+    ("docs/recipes.md", r"`HANDSHAKE_TIMEOUT_S` \| (\S+) s", HANDSHAKE_TIMEOUT_S),
     ("docs/recordings.md", r"in chunks of at most (\S+) KiB", CHUNK_BYTES / 1024),
 ]
 
@@ -133,7 +138,7 @@ def default(key: str) -> float:
         elif name.isdecimal():
             value = value[int(name)]
         else:
-            value = value.model_fields[name].default if isinstance(value, type) else getattr(value, name)
+            value = TlsConfig.model_fields[name].default if value is TlsConfig else getattr(value, name)
     return float(value)
 
 
@@ -179,7 +184,7 @@ def test_model_page_lists_every_integrator() -> None:
 
 def test_every_preset_is_documented() -> None:
     names = list(PRESETS)
-    page = (ROOT / "docs/studies.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/impairment.md").read_text(encoding="utf-8")
     rows = page.partition("| preset |")[2].partition("\n\n")[0]
     assert re.findall(r"^\| `([\w-]+)`", rows, re.MULTILINE) == names[1:]
     listed = f"{', '.join(names[:-1])} or {names[-1]}."
@@ -226,10 +231,12 @@ def test_example_controller_knows_the_default_arm_and_scene() -> None:
 def test_every_key_of_the_lab_file_is_used() -> None:
     sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
     text = "".join(path.read_text(encoding="utf-8") for path in sources if not path.stem.endswith("_pb2"))
-    models = [LabConfig, SimConfig, EdgeConfig, TlsConfig, RecorderConfig, BusConfig, BusTlsConfig, RigSettings]
+    models: list[type[BaseModel]] = [LabConfig, SimConfig, EdgeConfig, TlsConfig, RecorderConfig, BusConfig]
+    models += [BusTlsConfig, RigSettings, ArmConfig, SceneConfig, TableConfig, MagnetConfig, PartConfig, TrayConfig]
+    models.append(TaskConfig)
     assert [
         f"{model.__name__}.{key}"
-        for model in [*models, ArmConfig, SceneConfig, TableConfig, MagnetConfig, PartConfig, TrayConfig, TaskConfig]
+        for model in models
         for key in model.model_fields
         if not re.search(rf"\.{key}\b", text)
     ] == []

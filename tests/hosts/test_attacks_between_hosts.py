@@ -1,6 +1,6 @@
 """A secured lab on six hosts under attack: request flood, invalid certificates, a certificate that expires in use.
 
-docs/operations.md documents the guarantees.
+docs/security.md documents the guarantees.
 """
 
 import subprocess

@@ -1,6 +1,6 @@
 """Faults in a lab on five hosts around a router: the torque becomes zero, and the loop recovers automatically.
 
-docs/operations.md documents the guarantees.
+docs/several-hosts.md documents the guarantees.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Recordings are backed up and restored while the lab runs, as described in docs/operations.md."""
+"""Recordings are backed up and restored while the lab runs, as described in docs/maintenance.md."""
 
 import json
 import shutil

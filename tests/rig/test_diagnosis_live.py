@@ -1,6 +1,6 @@
 """Diagnosis of recordings of real programs with one mistake each, and of services that were disturbed.
 
-With HILRIG_LONG in the environment for more runs of each cause: the live part of the table in docs/timing.md.
+With HILRIG_LONG in the environment for more runs of each cause: the live part of the table in docs/diagnosis.md.
 """
 
 import os

@@ -13,6 +13,8 @@ from typing import Any
 
 IMPORTED = (
     "hilrig_cli.main",
+    "hilrig_cli.json_output.lab",
+    "hilrig_cli.json_output.recordings",
     "hilrig_cli.local.local_lab",
     "hilrig_replay.report.report",
     "hilrig_replay.analysis.verify",

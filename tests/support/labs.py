@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
+from support.json_output import check_json_output
 from support.waiting import eventually
 
 HILRIG = [sys.executable, "-m", "hilrig_cli"]
@@ -45,6 +46,7 @@ def hilrig(
 ) -> subprocess.CompletedProcess[str]:
     """Run a `hilrig` command in a process that is forked from a server with the modules already imported.
 
+    The output of a command with `--json` is checked against its published schema.
     tests/rig/test_documentation.py tests commands in new Python processes.
     """
     command = list(map(str, arguments))
@@ -58,7 +60,10 @@ def hilrig(
             code = _run_job(job, timeout_s)
         if code is None:
             raise subprocess.TimeoutExpired(command, timeout_s, out.read_text(), err.read_text())
-        return subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+        done = subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+    if "--json" in command and code in (0, 1):
+        check_json_output(command, done.stdout)
+    return done
 
 
 _SERVER_LOCK = threading.Lock()

@@ -23,6 +23,7 @@ def test_copy_of_an_exercise_is_a_valid_assignment(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     checked = hilrig("assign", "check", tmp_path / "4-inverse-kinematics", "--json")
     assert json.loads(checked.stdout) == {
+        "schema": "hilrig.assign-check/1",
         "assignment": "Inverse kinematics",
         "points": 10.0,
         "warnings": ["no deadline: attempts are never late"],

@@ -11,10 +11,12 @@ from typing import Any
 import pytest
 
 from hilrig_classroom.assignment import Assignment, AssignmentConfig, Measure, load_assignment
+from hilrig_classroom.evaluation import Attempt
 from hilrig_classroom.gradebook import fill_export, grades_csv, similar_text
+from hilrig_classroom.grades import attempt_that_counts
 from hilrig_classroom.output import GradeFolder
 from hilrig_classroom.pages import similar_groups
-from hilrig_runtime.config.roster import Roster, read_roster
+from hilrig_runtime.config.roster import Roster, Student, read_roster
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from support.labs import hilrig
@@ -96,13 +98,15 @@ def test_many_similar_students_are_one_group_and_a_short_cell() -> None:
             "same_recording": False,
         }
 
-    rows = [{"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names]
+    rows: list[dict[str, Any]] = [
+        {"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names
+    ]
     rows[0]["similar"][6]["share"] = 0.91
     pair = [{"id": "x", "similar": [run("y", 0.7)]}, {"id": "y", "similar": [run("x", 0.7)]}]
     document = {"students": [*rows, *pair, {"id": "alone", "similar": []}]}
     files = "; ".join(f"{name}: {name}.mcap" for name in names)
     assert similar_groups(document) == [
-        f"{files}: 91 % same torques to 60 % same torques",
+        f"{files}: 60 to 91 % same torques",
         "x: x.mcap; y: y.mcap: 70 % same torques",
     ]
     assert similar_text(rows[0]).startswith("s7 (91 % same torques), s1 (60 % same torques), ")
@@ -135,6 +139,17 @@ def test_table_has_no_formula(graded: tuple[Path, dict[str, Any]], classroom: Pa
     assert [row["name"] for row in rows] == ["Zoë Müller", "山田 太郎", "'=HYPERLINK(1)", "Bob", "Ann"]
     assert (rows[0]["goal: pose near"], rows[0]["goal: pose far"], rows[0]["max"]) == ("yes", "no", "20")
     assert rows[4]["points"] == ""
+
+
+def test_page_names_keep_the_marks_of_all_scripts(classroom: Path, tmp_path: Path) -> None:
+    roster = Roster((Student("s1", "आरव शर्मा"), Student("s2", "สมชาย ใจดี"), Student("s3", "../..")))
+    target = GradeFolder(tmp_path, classroom / "runs", load_assignment(classroom / "a"), roster, names=True)
+    target.write_pages({"students": [row_without_attempts(one.id) for one in roster.students], "assignment": "A"})
+    assert {path.stem for path in (tmp_path / "students").iterdir()} == {"s1-आरव_शर्मा", "s2-สมชาย_ใจดี", "s3"}
+
+
+def row_without_attempts(name: str) -> dict[str, Any]:
+    return {"id": name, "points": None, "override": None, "used": None, "attempts": [], "similar": []}
 
 
 def roster_of(classroom: Path) -> Roster:
@@ -171,10 +186,30 @@ def test_canvas_export_is_filled(classroom: Path, graded: tuple[Path, dict[str, 
 
 
 @pytest.mark.parametrize(
+    ("text", "system", "filled"),
+    [
+        ('Vorname;ID-Nummer;"Aufgabe: a, b, c (Punkte)"\nZ;zoe;-\nT;taro;8\nN;new;-\n', "Moodle", 2),
+        ("Prénom,Identifiant,Note\nZ,zoe,-\n", "Moodle", 1),
+        ("LastName,FirstName,ID,SIS User ID,SIS Login ID,Section\nM,Zoë,1,x,zoe@x.example,A\n", "Canvas", 1),
+        ("Étudiant,ID,Identifiant SIS,Section,Week 1 (4711)\nM,1,ZOE,A,\n", "Canvas", 1),
+    ],
+)
+def test_export_of_another_language_or_form_is_filled(
+    classroom: Path, graded: tuple[Path, dict[str, Any]], tmp_path: Path, text: str, system: str, filled: int
+) -> None:
+    (tmp_path / "x.csv").write_text(text, encoding="utf-8")
+    export = fill_export(tmp_path / "x.csv", graded[1], roster_of(classroom))
+    assert (export.system, export.filled) == (system, filled)
+    assert f"{rows_of(graded[1])['zoe']['points']:g}" in export.text
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "empty file"),
         ("a,b\n1,2\n", "no column with an id"),
+        ("Name,Points\nA,zoe\nB,zoe\nC,taro\n", "no column with an id"),
+        ("First name,ID number\nX,zoe,5,\n", "row 2 has 4 cells, the header 2"),
         ("First name,ID number\nX,unknown\n", "no id of the roster in ID number"),
     ],
 )
@@ -202,6 +237,38 @@ def test_penalty_of_a_late_attempt(late: int, penalty: float | None) -> None:
     rule = {"percent_per_day": 20.0, "last_day": 2.0}
     task = assignment(deadline=DEADLINE, grace_minutes=5.0, late=rule)
     assert task.penalty(DEADLINE.astimezone(UTC) + timedelta(seconds=late)) == penalty
+
+
+ATTEMPTS = [
+    Attempt(("a",), "", "rig1", "", raw=4.0),
+    Attempt(("b",), "", "rig1", "", raw=9.0),
+    Attempt(("c",), "", "rig1", "", raw=9.0, penalty=0.2),
+    Attempt(("broken",), "", "rig1", "", problem="not an MCAP file"),
+    Attempt(("d",), "", "rig1", "", raw=10.0, penalty=None),
+]
+
+
+@pytest.mark.parametrize(
+    ("settings", "file"),
+    [
+        ({"attempts": "best"}, "b"),
+        ({"attempts": "last"}, "c"),
+        ({"attempts": "best", "max_attempts": 1}, "a"),
+        ({"attempts": "last", "max_attempts": 2}, "b"),
+        # "broken" is one of the first four.
+        ({"attempts": "last", "max_attempts": 4}, "c"),
+    ],
+)
+def test_best_or_last_attempt_counts_unless_it_is_too_late(settings: dict[str, Any], file: str) -> None:
+    used = attempt_that_counts(ATTEMPTS, assignment(**settings).config)
+    assert used is not None
+    assert used.file == file
+
+
+def test_attempt_that_is_too_late_counts_if_it_is_the_only_one() -> None:
+    config = assignment().config
+    assert attempt_that_counts(ATTEMPTS[3:], config) is ATTEMPTS[4]
+    assert attempt_that_counts(ATTEMPTS[3:4], config) is None
 
 
 def test_points_of_a_measure_are_linear_between_its_bounds() -> None:
@@ -234,7 +301,7 @@ def test_invalid_settings_are_named(tmp_path: Path, settings: str, message: str)
 
 def test_grade_command_writes_pages_and_filled_exports(classroom: Path, tmp_path: Path) -> None:
     export = tmp_path / "moodle.csv"
-    export.write_text("Name,Username\nZ,zoe\n")
+    export.write_text("Name,Username\nZ,zoe\nA,new1\nB,new2\n")
     out = tmp_path / "out"
     result = hilrig(
         "grade",
@@ -253,6 +320,8 @@ def test_grade_command_writes_pages_and_filled_exports(classroom: Path, tmp_path
     assert result.returncode == 1, result.stderr
     assert "stranger.mcap: no student" in result.stderr
     assert "bob/run.mcap: " in result.stderr
+    assert "moodle.filled.csv: 2 students not in the roster, rows unchanged: new1, new2\n" in result.stderr
+    assert "moodle.filled.csv: 4 students without a row: taro, eve, bob, absent\n" in result.stderr
     reply = json.loads(result.stdout)
     assert reply["exports"] == [str(out / "moodle.filled.csv")]
     assert reply["grades"] == json.loads((out / "grades.json").read_text())

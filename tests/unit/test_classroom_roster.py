@@ -115,6 +115,17 @@ def test_unquoted_separator_in_a_name_is_a_mistake(tmp_path: Path) -> None:
         read_roster(roster_file(path, "id,name,rig,Rig\na,Ann,rig1,rig2\n"))
 
 
+def test_separators_within_quotation_marks_do_not_count(tmp_path: Path) -> None:
+    text = 'id;name;"first, second, third, fourth"\ns1;"Doe, Jane";x\n'
+    assert read_roster(roster_file(tmp_path / "r.csv", text)).students == (Student("s1", "Doe, Jane"),)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "cp1252"])
+def test_other_encodings_are_named(tmp_path: Path, encoding: str) -> None:
+    with pytest.raises(InputError, match="it is not UTF-8 text; save it as UTF-8"):
+        read_roster(roster_file(tmp_path / "r.csv", "id,name\na,Zoë\n", encoding))
+
+
 def test_rigs_of_a_roster_are_those_of_the_lab(tmp_path: Path) -> None:
     text = (
         "id,name,group,rig\na,Ann,A,rig1\nb,Bob,A,rig1\nc,Cy,B,rig1\nd,Dan,,rig9\ne,Eve,,rig2\nf,Fay,,rig2\ng,Gil,,\n"

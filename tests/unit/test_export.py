@@ -32,7 +32,7 @@ from hilrig_sim.arm.model import ArmParameters
 from support import recordings
 from support.labs import hilrig
 
-PAGE = Path(__file__).parents[2] / "docs/recordings.md"
+PAGE = Path(__file__).parents[2] / "docs/export.md"
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_interned_columns_are_exported_as_text(recording: Path) -> None:
 
 def test_documentation_lists_exactly_the_columns(recording: Path, tmp_path: Path) -> None:
     documented: dict[str, set[str]] = {name: set() for name in TABLES}
-    for line in PAGE.read_text(encoding="utf-8").split("### Columns of the tables")[1].splitlines():
+    for line in PAGE.read_text(encoding="utf-8").split("## Columns of the tables")[1].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         if len(cells) == 5 and "`" in cells[1]:
             for name in cells[0].split(", "):
@@ -167,7 +167,7 @@ def test_export_has_shapes_and_points_of_every_link(recording: Path, tmp_path: P
     with out.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = list(reader.iter_decoded_messages())
-        statistics = reader.get_summary().statistics
+        summary = reader.get_summary()
     scene = next(message for _, channel, _, message in found if channel.topic == "/scene")
     assert {entity.frame_id for entity in scene.entities} == links
     clouds = {channel.topic: message for _, channel, _, message in found if channel.topic.startswith("/points/")}
@@ -177,7 +177,9 @@ def test_export_has_shapes_and_points_of_every_link(recording: Path, tmp_path: P
         assert len(cloud.data) > 100 * cloud.point_stride
     logs = [message.message for _, channel, _, message in found if channel.topic == "/log"]
     assert len(logs) == len(run.events)
-    assert statistics.message_count == len(found)
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(found)
 
 
 @pytest.mark.parametrize(

@@ -141,8 +141,8 @@ def test_invalid_value_is_reported_with_its_place(text: str, complaint: str) -> 
 
 
 def test_page_agrees_with_the_models() -> None:
-    page = (Path(__file__).parents[2] / "docs/studies.md").read_text()
-    section = page.partition("## Delay and loss in the live loop")[2]
+    page = (Path(__file__).parents[2] / "docs/impairment.md").read_text()
+    section = page.partition("# Delay and loss in the live loop")[2]
     example = section.partition("```toml\n")[2].partition("```")[0]
     impairment = parse_lab(example).impairment
     assert impairment.links.command == LinkImpairment.model_validate(

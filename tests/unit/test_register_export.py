@@ -32,5 +32,6 @@ def test_csv_has_every_value_of_the_map() -> None:
 def test_command_prints_the_map_in_each_format() -> None:
     assert hilrig("registers", "--csv").stdout == export.as_csv()
     assert hilrig("registers", "--markdown").stdout == export.as_markdown()
-    assert json.loads(hilrig("registers", "--json").stdout) == export.as_rows()
+    rows = json.loads(hilrig("registers", "--json").stdout)
+    assert rows == [{"schema": "hilrig.registers/1", **row} for row in export.as_rows()]
     assert "theta1" in hilrig("registers").stdout

@@ -54,8 +54,8 @@ def test_timing_page_has_the_table_of_stages() -> None:
     ]
 
 
-def test_recordings_page_has_the_formulas_of_the_stages() -> None:
-    text = " ".join((DOCS / "recordings.md").read_text(encoding="utf-8").split())
+def test_export_page_has_the_formulas_of_the_stages() -> None:
+    text = " ".join((DOCS / "export.md").read_text(encoding="utf-8").split())
     for stage in {*LOOP_STAGES, *CLIENT_STAGES} - {TRANSPORT}:
         assert f"{stage.title} `{stage.formula}`" in text
     assert f"{TITLES[-1]} the remainder of the loop latency" in text

@@ -298,7 +298,7 @@ class ScheduledImpairment(ImpairmentSetting):
 
 
 class ImpairmentConfig(ImpairmentSetting):
-    """Emulated network delay and loss, for latency studies (docs/studies.md)."""
+    """Emulated network delay and loss, for latency studies (docs/impairment.md)."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     """The same seed gives the same delays and losses, message by message, in each session."""

@@ -164,9 +164,9 @@ def read_table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def delimiter_of(text: str) -> str:
-    """Delimiter of a CSV text: the one that occurs most often in its first line."""
+    """Delimiter of a CSV text: the one that occurs most often in its first line outside quotation marks."""
     first = text.lstrip().split("\n", 1)[0]
-    return max(DELIMITERS, key=first.count)
+    return max(DELIMITERS, key=re.sub('"[^"]*"', "", first).count)
 
 
 def _clean(cell: str) -> str:

@@ -54,7 +54,7 @@ def read_text(path: Path) -> str:
             raise InputError(f"{path}: can't be read: larger than {MAX_TEXT_BYTES >> 20} MiB")
         return content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text; save it as UTF-8"
         raise InputError(f"{path}: can't be read: {reason}") from error
 
 

@@ -7,7 +7,7 @@ formula get an apostrophe. Points are numbers with a decimal point.
 import csv
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +20,8 @@ from hilrig_runtime.escaping import csv_text
 NO_GRADE: Final = "-"
 """Moodle and Canvas: no grade. An empty cell or 0 would be a grade in one of them."""
 _CANVAS_FIRST: Final = "Student"
-_CANVAS_KEYS: Final = ("SIS User ID", "SIS Login ID", "ID")
+_SIS_KEYS: Final = frozenset({"SIS User ID", "SIS Login ID"})
+_CANVAS_KEYS: Final = (*sorted(_SIS_KEYS, reverse=True), "ID")
 _CANVAS_RESERVED: Final = re.compile(r"\b(Current|Final|Override) (Score|Grade|Points)\b")
 """Canvas drops columns with such headers."""
 MAX_SIMILAR: Final = 5
@@ -93,8 +94,14 @@ def fill_export(path: Path, document: dict[str, Any], roster: Roster) -> FilledE
         raise InputError(f"{path}: no CSV table: {error}") from error
     if not table:
         raise InputError(f"{path}: empty file; expected the gradebook export of Moodle or Canvas")
+    for number, row in enumerate(table[1:], start=2):
+        if any(row[len(table[0]) :]):
+            raise InputError(
+                f"{path}: row {number} has {len(row)} cells, the header {len(table[0])}: export the gradebook again"
+            )
+        del row[len(table[0]) :]
     header, title = table[0], str(document["assignment"])
-    is_canvas = header[0].strip() == _CANVAS_FIRST
+    is_canvas = _is_canvas(header, title)
     keys = _CANVAS_KEYS if is_canvas else _MOODLE_KEYS
     key = _key_column(path, header, table[1:], keys, roster)
     if is_canvas:
@@ -176,23 +183,29 @@ def _goal_names(document: dict[str, Any]) -> list[str]:
 
 
 def _key_column(
-    path: Path, header: Sequence[str], rows: Iterable[list[str]], keys: Sequence[str], roster: Roster
+    path: Path, header: Sequence[str], rows: Sequence[list[str]], keys: Sequence[str], roster: Roster
 ) -> int:
-    """Column whose cells are ids of the roster: of the known ones, that with the most of them."""
+    """Column whose cells are ids of the roster: of those with a known header, else of all, that with the most."""
     ids = {student.id.lower() for student in roster.students}
-    rows = list(rows)
+    found: dict[int, list[str]] = {at: [] for at in range(len(header))}
+    for row in rows:
+        for at, cell in enumerate(row):
+            if (name := _id_of(cell)) in ids:
+                found[at].append(name)
     known = [at for at, name in enumerate(header) if name.strip() in keys]
+    # With headers in another language: a column with half of the ids, each of them once.
+    enough = max(min(len(rows), len(ids)) / 2, 1)
+    candidates = [at for at in known if found[at]]
+    candidates = candidates or [at for at, names in found.items() if len(names) == len(set(names)) >= enough]
+    if candidates:
+        return max(candidates, key=lambda at: len(found[at]))
     if not known:
         raise InputError(
             f"{path}: no column with an id: found {', '.join(header[:6])}; expected the gradebook export of Moodle "
             f"({', '.join(_MOODLE_KEYS)}) or of Canvas (Student, {', '.join(_CANVAS_KEYS)})"
         )
-    matches = {at: sum(at < len(row) and _id_of(row[at]) in ids for row in rows) for at in known}
-    best = max(known, key=lambda at: matches[at])
-    if not matches[best]:
-        names = ", ".join(header[at] for at in known)
-        raise InputError(f"{path}: no id of the roster in {names}: use the ids of this gradebook in the roster")
-    return best
+    names = ", ".join(header[at] for at in known)
+    raise InputError(f"{path}: no id of the roster in {names}: use the ids of this gradebook in the roster")
 
 
 def _id_of(cell: str) -> str:
@@ -200,13 +213,24 @@ def _id_of(cell: str) -> str:
     return cell.strip().lstrip("'").partition("@")[0].lower()
 
 
+def _is_canvas(header: Sequence[str], title: str) -> bool:
+    """Whether the header is one of Canvas, in any language: it has SIS columns, or the assignment with its number."""
+    names = {name.strip() for name in header}
+    return header[0].strip() == _CANVAS_FIRST or bool(names & _SIS_KEYS) or _numbered(title, header) is not None
+
+
 def _canvas_title(title: str, header: Sequence[str]) -> str:
     """Header of the assignment's column: "Title (12345)" of the export, else the title."""
-    for name in header:
-        if re.fullmatch(re.escape(title) + r"\s*\(\d+\)", name.strip()):
-            return name
-    check_title(title)
-    return title
+    name = _numbered(title, header)
+    if name is None:
+        check_title(title)
+    return name or title
+
+
+def _numbered(title: str, header: Sequence[str]) -> str | None:
+    """The header "Title (12345)"; None: not found."""
+    pattern = re.compile(re.escape(title) + r"\s*\(\d+\)")
+    return next((name for name in header if pattern.fullmatch(name.strip())), None)
 
 
 def check_title(title: str) -> None:

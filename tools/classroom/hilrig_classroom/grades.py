@@ -9,7 +9,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_classroom.assignment import Assignment
+from hilrig_classroom.assignment import Assignment, AssignmentConfig
 from hilrig_classroom.attempts import owner_of
 from hilrig_classroom.evaluation import Attempt, evaluate, identify, with_points
 from hilrig_replay.analysis.similarity import find_similar
@@ -227,15 +227,26 @@ def _attempt(files: RunFiles, folder: Path, task: TaskConfig, roster: Roster, on
 def _grade(
     student: Student, attempts: list[Attempt], assignment: Assignment, override: Override | None
 ) -> StudentGrade:
-    config = assignment.config
     ordered = tuple(sorted(attempts, key=lambda attempt: (attempt.started, attempt.file)))
-    counted = ordered[: config.max_attempts] if config.max_attempts else ordered
+    return StudentGrade(student, ordered, attempt_that_counts(ordered, assignment.config), override=override)
+
+
+def attempt_that_counts(attempts: Sequence[Attempt], config: AssignmentConfig) -> Attempt | None:
+    """The attempt whose points a student gets; None: no attempt can be graded.
+
+    An attempt that is too late counts only if there is no other one.
+
+    Args:
+        attempts: attempts of the student in the order of their start.
+        config: the assignment's settings.
+    """
+    counted = attempts[: config.max_attempts] if config.max_attempts else attempts
     gradable = [attempt for attempt in counted if not attempt.problem]
-    used: Attempt | None = None
-    if gradable:
-        # Of equal attempts, the first one.
-        used = gradable[-1] if config.attempts == "last" else max(gradable, key=lambda attempt: attempt.points)
-    return StudentGrade(student, ordered, used, override=override)
+    accepted = [attempt for attempt in gradable if attempt.penalty is not None] or gradable
+    if not accepted:
+        return None
+    # Of equal attempts, the first one.
+    return accepted[-1] if config.attempts == "last" else max(accepted, key=lambda attempt: attempt.points)
 
 
 def _with_similar(grades: Sequence[StudentGrade]) -> list[StudentGrade]:

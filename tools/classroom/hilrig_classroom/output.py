@@ -148,6 +148,8 @@ def _file_name(student: Student, with_name: bool) -> str:
     if not with_name:
         return student.id
     letters = unicodedata.normalize("NFC", student.name)
-    name = "".join(letter if letter.isalnum() else "_" for letter in letters).strip("_")
+    # Marks are the vowels of many scripts.
+    kept = (letter.isalnum() or unicodedata.category(letter).startswith("M") for letter in letters)
+    name = "".join(letter if keep else "_" for letter, keep in zip(letters, kept, strict=True)).strip("_")
     # At most 255 bytes in UTF-8, with the id in front and the suffix.
-    return f"{student.id}-{name.encode()[:120].decode(errors='ignore')}"
+    return f"{student.id}-{name.encode()[:120].decode(errors='ignore')}" if name else student.id

@@ -7,7 +7,7 @@ w1 = θ̇1 and w2 = θ̇1 + θ̇2, the speeds of the two links in the world, equ
     p·ẇ1 + A22·ẇ2 = Q2,  Q2 = τ2 + n_z − b2θ̇2 − l2 l3 M sinθ2 · w1²
 
 with I1 = l2²(m1+M), A22 = M l3², p = l2 l3 M cosθ2: the same model in fewer operations. Joints 3 and 4 are (32) and
-decision 2 of docs/model.md.
+decision 2 of docs/model-decisions.md.
 
 Vectors are (rows, rigs), one row per quantity, so that each operation runs along contiguous memory, and the result of
 a rig does not depend on the number of rigs. A step allocates no memory and uses no BLAS: its sums depend on the shape.

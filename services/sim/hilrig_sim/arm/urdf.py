@@ -2,8 +2,8 @@
 
 Each moving link has its point mass at the position of the reduced model, (17)–(19). Physics engines reject a zero
 inertia tensor, so it is `POINT_INERTIA`. The inertia of joint 4 belongs to its drive and rotates with θ4 only
-(docs/model.md, decision 2). URDF has no element for that: set it as the armature of the joint in the engine (MuJoCo
-`dof_armature`, Pinocchio `armature`). Visuals are primitives, and there is no collision geometry.
+(docs/model-decisions.md, decision 2). URDF has no element for that: set it as the armature of the joint in the engine
+(MuJoCo `dof_armature`, Pinocchio `armature`). Visuals are primitives, and there is no collision geometry.
 """
 
 import math

@@ -1,6 +1,6 @@
 """Hard stops: an inelastic impact stops a joint at its limit, and a joint pressed against its stop stays there.
 
-An impulse acts on the stopped joint alone and couples into the others through the mass matrix (docs/model.md,
+An impulse acts on the stopped joint alone and couples into the others through the mass matrix (docs/model-decisions.md,
 decision 4). If joints 1 and 2 are both at stops, each stop may push, but not pull: this is a linear
 complementarity problem in two unknowns, and its solution is the velocity without outward motion that is nearest to the
 velocity before, measured by kinetic energy. So an impact never adds energy.

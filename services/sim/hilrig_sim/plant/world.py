@@ -1,8 +1,8 @@
 """Scenes of N rigs: parts, trays, table and magnet; parts are picked, held, released and fall.
 
-Contact is vertical only and footprints are discs (docs/model.md, decision 9): a tool, a held part and a falling part
-stop on the highest object below them, and no part is pushed sideways. Rigs may have different numbers of parts and
-trays; the arrays have the size of the largest number, and unused entries are far away.
+Contact is vertical only and footprints are discs (docs/model-decisions.md, decision 9): a tool, a held part and a
+falling part stop on the highest object below them, and no part is pushed sideways. Rigs may have different numbers of
+parts and trays; the arrays have the size of the largest number, and unused entries are far away.
 """
 
 import math

@@ -1,6 +1,5 @@
 """`hilrig assign check FOLDER`: validates an assignment of a class, also with a reference solution."""
 
-import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -53,6 +52,8 @@ def check(
     from rich.progress import Progress
 
     from hilrig_classroom.check import check_assignment, warnings
+    from hilrig_cli.json_output.classroom import AssignCheckOutput, AttemptValues
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.escaping import printable
 
@@ -70,8 +71,9 @@ def check(
             show = partial(progress.update, bar)
             attempt = _graded(assignment, lab, solution, out, limit_s, lambda share: show(completed=share))
     if as_json:
-        result = {"assignment": config.title, "points": config.rubric.points, "warnings": notes}
-        print(json.dumps(result | {"solution": None if attempt is None else attempt.as_dict()}))
+        solved = None if attempt is None else AttemptValues.model_validate(attempt.as_dict())
+        points = config.rubric.points
+        print_json(AssignCheckOutput(assignment=config.title, points=points, warnings=list(notes), solution=solved))
     else:
         print(f"{printable(str(folder))}: {printable(config.title)}: valid")
         if attempt is not None:

@@ -1,6 +1,5 @@
 """`hilrig certs`: creates a lab's certificates for Modbus/TCP Security and for the bus."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +50,8 @@ def certs(
     from datetime import UTC, datetime
 
     from hilrig_cli.cert_store import CertificateStore
+    from hilrig_cli.json_output.lab import CertsOutput, RevokeOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.revocation import revoke_client
     from hilrig_runtime.bus.acl import identities
     from hilrig_runtime.config.bus import BusTlsConfig
@@ -60,7 +61,10 @@ def certs(
     lab = load_lab(config)
     if revoke:
         results = revoke_client(lab, revoke)
-        print(json.dumps({"revoked": revoke, "edges": results}) if as_json else "\n".join(results.values()))
+        if as_json:
+            print_json(RevokeOutput(revoked=revoke, edges=results))
+        else:
+            print("\n".join(results.values()))
         return
     now = datetime.now(UTC)
     clients = dict(_parse_client(text) for text in client or ["operator=operator", "observer=observer"])
@@ -95,7 +99,7 @@ def certs(
     }
     written = [str(path) for path in (*controllers.written, *bus.written)]
     if as_json:
-        print(json.dumps({"written": written, **tables}))
+        print_json(CertsOutput.model_validate({"written": written, **tables}))
         return
     for path in written:
         print(f"wrote {path}")

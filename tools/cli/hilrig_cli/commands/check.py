@@ -1,6 +1,5 @@
 """`hilrig check`: validates a lab's configuration file."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -23,6 +22,8 @@ def check(
     """Validate a lab's configuration file and roster: report every error, and print the rigs with their addresses."""
     from rich.table import Table
 
+    from hilrig_cli.json_output.lab import CheckOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.addresses import format_address
     from hilrig_runtime.config.lab import load_lab
@@ -40,7 +41,7 @@ def check(
     roster = None if lab.classroom is None else lab.classroom.students([rig.name for rig in lab.rigs])
     if as_json:
         found = {"ports": lab.ports, "tls_ports": lab.tls_ports, "warnings": list(accuracy_warnings(rigs))}
-        print(json.dumps(lab.model_dump(mode="json") | found))
+        print_json(CheckOutput.model_validate(dict(lab) | found))
         return
     addresses = lab.addresses()
     is_restricted = any(rig.allow for rig in lab.rigs)

@@ -1,6 +1,5 @@
 """`hilrig claim`: claims a rig with a student's code."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -50,6 +49,8 @@ def claim(
     the name in the certificate. A program can claim the rig too: it writes the ten letters of the code into holding
     registers 401 to 405. Exit code 1: the code was refused; the reason is an event of the rig.
     """
+    from hilrig_cli.json_output.lab import ClaimOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_runtime.addresses import format_address
     from hilrig_runtime.config.claim_codes import CODE_LETTERS, letters_of
     from hilrig_runtime.config.lab import load_lab
@@ -66,7 +67,7 @@ def claim(
     where = format_address(host, port)
     reason = "" if not exception else _REASONS.get(exception, f"the rig answered with exception {exception:02X}")
     if as_json:
-        print(json.dumps({"rig": where, "claimed": not exception, "reason": reason}))
+        print_json(ClaimOutput(rig=where, claimed=not exception, reason=reason))
     elif not exception:
         print(f"the rig at {where} is yours until the end of the lab slot")
     else:

@@ -1,6 +1,5 @@
 """`hilrig compare`: differences between runs."""
 
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +37,8 @@ def compare(
 
     Exit code 1: at least one of several recordings could not be compared; it is listed with the reason.
     """
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import CompareOutput
     from hilrig_replay.analysis.compare import compare as compare_runs
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.paths import find_each_run
@@ -69,7 +70,7 @@ def compare(
     if save is not None:
         save_rrd(comparison.runs, save)
     if as_json:
-        print(json.dumps(comparison.as_dict()))
+        print_json(CompareOutput.model_validate(comparison.as_dict()))
     else:
         _print(comparison)
         for reason in comparison.left_out:

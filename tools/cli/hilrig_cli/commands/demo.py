@@ -1,6 +1,5 @@
 """`hilrig demo`: runs a lab with the example controller and analyzes the recording."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -28,6 +27,8 @@ def demo(
     from rich.progress import Progress, TimeElapsedColumn
 
     from hilrig_cli.commands.latency import print_report
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import DemoOutput
     from hilrig_cli.local.demo import review, run_demo
     from hilrig_cli.terminal import TerminalConsole
 
@@ -42,7 +43,7 @@ def demo(
     with console.status("measuring, verifying and plotting the run"):
         result = review(recorded, out)
     if as_json:
-        print(json.dumps(result.as_dict()))
+        print_json(DemoOutput.model_validate(result.as_dict()))
     else:
         print_report(result.latency)
         for line in result.summary_lines():

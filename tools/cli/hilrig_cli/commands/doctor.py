@@ -1,7 +1,5 @@
 """`hilrig doctor`: diagnosis of a deployment."""
 
-import json
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -38,13 +36,15 @@ def doctor(
     Run it on each host, before or while the lab runs. Exit code 1: at least one error was found.
     """
     from hilrig_cli.doctor import Level
+    from hilrig_cli.json_output.lab import DoctorOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
     results = _check_service(lab, service, instance) if service else _check_all(lab)
     errors = [result for result in results if result.level is Level.ERROR]
     if as_json:
-        print(json.dumps({"lab": lab.name, "well": not errors, "findings": [asdict(result) for result in results]}))
+        print_json(DoctorOutput(lab=lab.name, well=not errors, findings=results))
     else:
         _print_table(results)
     if errors:

@@ -1,6 +1,5 @@
 """`hilrig events`: prints the events of a recording, or of a running lab as they happen."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -35,6 +34,8 @@ def events(
 
     An event has its time, severity, rig (or service), kind and a sentence.
     """
+    from hilrig_cli.json_output.lab import EventsOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.escaping import printable
     from hilrig_schemas import Event
@@ -52,7 +53,10 @@ def events(
             and (not rig or event.rig in rig)
             and event.severity > lowest
         ):
-            print(json.dumps(_row(event)) if as_json else printable(_line(event)), flush=True)
+            if as_json:
+                print_json(EventsOutput.model_validate(_row(event)))
+            else:
+                print(printable(_line(event)), flush=True)
 
 
 def _recorded(path: Path) -> "Iterator[Event]":

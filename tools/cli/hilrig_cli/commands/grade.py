@@ -1,6 +1,5 @@
 """`hilrig grade`: grades of a class for one assignment."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -42,8 +41,11 @@ def grade(
 
     from hilrig_classroom.assignment import load_assignment
     from hilrig_classroom.output import GradeFolder
+    from hilrig_cli.json_output.classroom import GradeOutput, GradesDocument
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.roster import read_roster
+    from hilrig_runtime.errors import list_names
     from hilrig_runtime.escaping import printable
 
     task, people = load_assignment(assignment), read_roster(roster)
@@ -58,17 +60,19 @@ def grade(
             target.write_pages(document, student, lambda done: progress.update(bar, completed=share + share * done))
     problems = target.problems(document)
     if as_json:
-        print(json.dumps({"folder": str(out), "grades": document, "exports": [str(path) for path, _ in exports]}))
+        filled = [str(path) for path, _ in exports]
+        print_json(GradeOutput(folder=str(out), grades=GradesDocument.model_validate(document), exports=filled))
     else:
         graded = sum(row["points"] is not None for row in document["students"])
         print(f"{printable(str(out))}: {graded} of {len(document['students'])} students with a grade")
         for path, export in exports:
             print(f"{printable(str(path))}: {export.filled} grades for {export.system}")
     for path, export in exports:
-        for key in export.unknown:
-            print(f"{printable(str(path))}: {printable(key)} is not in the roster; row unchanged", file=sys.stderr)
-        for one in export.absent:
-            print(f"{printable(str(path))}: student {one} has no row", file=sys.stderr)
+        # A course may have more students than the roster.
+        for listed, text in ((export.unknown, "not in the roster, rows unchanged"), (export.absent, "without a row")):
+            if listed:
+                students = f"{len(listed)} student{'s' * (len(listed) > 1)} {text}: {list_names(listed, 40)}"
+                print(printable(f"{path}: {students}"), file=sys.stderr)
     for problem in problems:
         print(printable(problem), file=sys.stderr)
     if problems:

@@ -1,6 +1,5 @@
 """`hilrig ik`: inverse kinematics of a rig's arm."""
 
-import json
 import math
 from typing import Annotated
 
@@ -24,6 +23,8 @@ def ik(
     """
     from rich.table import Table
 
+    from hilrig_cli.json_output.lab import IkOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.lab import LabConfig, load_lab
     from hilrig_runtime.errors import InputError
@@ -42,7 +43,7 @@ def ik(
     except UnreachableError as error:
         solutions, reason = [], str(error)
     if as_json:
-        print(json.dumps({"joints_deg_deg_mm_deg": solutions, "reason": reason or None}))
+        print_json(IkOutput(joints_deg_deg_mm_deg=solutions, reason=reason or None))
     elif reason:
         print(f"no solution: {reason}")
     else:

@@ -51,6 +51,8 @@ def impair(
     lost. Each change is recorded as an event, and each delay with its command.
     """
     from hilrig_cli.client import query_edges
+    from hilrig_cli.json_output.lab import ImpairOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_schemas import ImpairmentRequest, topics
@@ -67,8 +69,8 @@ def impair(
         request.set_json = _impairment(preset, state, command, loss, trace, seed).model_dump_json()
     statuses = query_edges(load_lab(config), topics.IMPAIRMENT, rigs or [], request)
     if as_json:
-        rows = [_row(status) for status in statuses]
-        print(json.dumps(rows[0] if len(rigs or []) == 1 else rows))
+        rows = [ImpairOutput.model_validate(_row(status)) for status in statuses]
+        print_json(rows[0] if len(rigs or []) == 1 else rows)
     else:
         _print_table(statuses)
 

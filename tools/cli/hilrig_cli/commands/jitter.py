@@ -1,6 +1,5 @@
 """`hilrig jitter`: timing benchmark of this host."""
 
-import json
 import sys
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,13 +24,16 @@ def jitter(
     The lab runs on free ports. The result is a verdict: suitable or not suitable for a study at the given step.
     Exit code 1: not suitable; the reasons are printed.
     """
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.study import JitterCondition, JitterOutput
     from hilrig_sim.platform_fingerprint import machine_name
 
     measured = [_measure(step_ms, seconds, loaded) for loaded in ((False, True) if load else (False,))]
     is_suitable = not any(result.reasons for result in measured)
     if as_json:
-        conditions = [result.as_dict() for result in measured]
-        print(json.dumps({"machine": machine_name(), "step_ms": step_ms, "conditions": conditions, "fit": is_suitable}))
+        conditions = [JitterCondition.model_validate(result.as_dict()) for result in measured]
+        machine = machine_name()
+        print_json(JitterOutput(machine=machine, step_ms=step_ms, conditions=conditions, fit=is_suitable))
     else:
         for result in measured:
             _print_table(result)

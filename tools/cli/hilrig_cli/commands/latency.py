@@ -1,6 +1,5 @@
 """`hilrig latency`: loop latency of recordings, from a state to the tick at which its torque acts."""
 
-import json
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -40,6 +39,8 @@ def latency(
     Exit code 1: a recording is not valid for latency measurements, or one of several is unreadable; the reasons are
     printed.
     """
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import LatencyOutput, LatencyRunsOutput
     from hilrig_replay.analysis.intervals import aggregate
     from hilrig_replay.analysis.latency import measure
     from hilrig_replay.io.isolation import isolated
@@ -75,8 +76,11 @@ def latency(
         reports.append((path, report.without_table()))
     if as_json:
         every = [{"path": str(path), **each.as_dict()} for path, each in reports]
-        overview = {"runs": every, "aggregate": aggregate(every), "unreadable": unreadable}
-        print(json.dumps(reports[0][1].as_dict() if len(paths) == 1 else overview))
+        if len(paths) == 1:
+            print_json(LatencyOutput.model_validate(reports[0][1].as_dict()))
+        else:
+            overview = {"runs": every, "aggregate": aggregate(every), "unreadable": unreadable}
+            print_json(LatencyRunsOutput.model_validate(overview))
     elif len(paths) == 1:
         print_report(reports[0][1])
     else:

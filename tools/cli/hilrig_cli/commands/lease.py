@@ -1,6 +1,5 @@
 """`hilrig lease`: shows or releases the lease of a rig."""
 
-import json
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -27,6 +26,8 @@ def lease(
     with this or another code. Exit code 1: a rig had no lease holder, or was not claimed.
     """
     from hilrig_cli.client import query_edges
+    from hilrig_cli.json_output.lab import LeaseOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_runtime.config.lab import load_lab
     from hilrig_schemas import LeaseRequest, topics
 
@@ -35,8 +36,8 @@ def lease(
     request = LeaseRequest(release=release, end_claim=end_claim)
     statuses = query_edges(load_lab(config), topics.LEASE, rigs or [], request)
     if as_json:
-        rows = [_row(status) for status in statuses]
-        print(json.dumps(rows[0] if len(rigs or []) == 1 else rows))
+        rows = [LeaseOutput.model_validate(_row(status)) for status in statuses]
+        print_json(rows[0] if len(rigs or []) == 1 else rows)
     else:
         _print_table(statuses, release, end_claim)
     done = [(not release or status.released) and (not end_claim or status.claim_ended) for status in statuses]
@@ -57,7 +58,10 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
         "client_of": status.client_of,
         "controller_fault": status.controller_fault,
         "skipped_states": status.skipped_states,
-    } | {key: getattr(status, key) for key in ("student", "claimed_from", "claim_ended") if getattr(status, key)}
+        "student": status.student,
+        "claimed_from": status.claimed_from,
+        "claim_ended": status.claim_ended,
+    }
 
 
 def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) -> None:

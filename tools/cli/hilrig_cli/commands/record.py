@@ -1,6 +1,5 @@
 """`hilrig record start RIG`, `hilrig record stop RIG`: manual recording sessions."""
 
-import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -69,9 +68,12 @@ def _request(
 
 
 def _print(sessions: dict[str, str], text: str, as_json: bool) -> None:
-    rows = [{"rig": rig, "session": session} for rig, session in sessions.items()]
+    from hilrig_cli.json_output.lab import RecordOutput
+    from hilrig_cli.json_output.model import print_json
+
     if as_json:
-        print(json.dumps(rows[0] if len(rows) == 1 else rows))
+        rows = [RecordOutput(rig=rig, session=session) for rig, session in sessions.items()]
+        print_json(rows[0] if len(rows) == 1 else rows)
     else:
-        for row in rows:
-            print(text.format_map(row))
+        for rig, session in sessions.items():
+            print(text.format(rig=rig, session=session))

@@ -27,9 +27,10 @@ def recover(
     `RUN.mcap.part` becomes `RUN.mcap`; any other file is recovered to a new `.recovered.mcap` file in the same folder.
     Exit code 1: data was lost, or one of several files can't be recovered.
     """
-    import json
     from dataclasses import asdict
 
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import RecoverOutput
     from hilrig_recorder.mcap_format.file_names import PART_SUFFIX, recovered_path
     from hilrig_recorder.mcap_format.recover import recover as recover_file
     from hilrig_runtime.errors import HilrigError, InputError
@@ -54,7 +55,14 @@ def recover(
         if not as_json:
             _print(recovery)
     if as_json:
-        print(json.dumps([asdict(recovery) for recovery in recoveries], indent=2, default=str))
+        print_json(
+            [
+                RecoverOutput.model_validate(
+                    asdict(one) | {"source": str(one.source), "path": None if one.path is None else str(one.path)}
+                )
+                for one in recoveries
+            ]
+        )
     if failed or any(recovery.damaged_bytes or recovery.orphans for recovery in recoveries):
         raise typer.Exit(1)
 

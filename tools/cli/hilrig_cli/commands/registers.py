@@ -1,6 +1,5 @@
 """`hilrig registers`: prints the register map of a rig as a table, CSV, Markdown or JSON."""
 
-import json
 from typing import Annotated
 
 import typer
@@ -14,6 +13,8 @@ def registers(
     as_json: AsJson = False,
 ) -> None:
     """Print the register map: every register and coil of a rig with its type, unit, scale and meaning."""
+    from hilrig_cli.json_output.lab import RegistersOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_modbus_edge.registers import export
 
     if as_csv:
@@ -21,7 +22,7 @@ def registers(
     elif as_markdown:
         print(export.as_markdown(), end="")
     elif as_json:
-        print(json.dumps(export.as_rows()))
+        print_json([RegistersOutput.model_validate(row) for row in export.as_rows()])
     else:
         _print_table(export.as_rows())
 

@@ -1,6 +1,5 @@
 """`hilrig report`: HTML report of one run, or of a ranked group of runs."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -36,6 +35,8 @@ def report(
     """
     from rich.progress import Progress
 
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import ReportedRun, ReportOutput
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.grading.task_loading import load_task
     from hilrig_replay.io.output_file import check_output, output_file
@@ -60,15 +61,13 @@ def report(
     with output_file(out, inputs) as page:
         page.write_text(result.html, encoding="utf-8")
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "page": str(out),
-                    "runs": result.runs,
-                    "left_out": result.left_out,
-                    "alike": result.same_torques,
-                    "overlaps": result.overlaps,
-                }
+        print_json(
+            ReportOutput(
+                page=str(out),
+                runs=tuple(map(ReportedRun.model_validate, result.runs)),
+                left_out=result.left_out,
+                alike=result.same_torques,
+                overlaps=result.overlaps,
             )
         )
     else:

@@ -30,12 +30,14 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     """List the rigs of a running lab with their addresses, simulation and edge, including rigs added at run time."""
     from rich.table import Table
 
+    from hilrig_cli.json_output.lab import RigListOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
 
     with _join(config) as (lab, _, found):
         rows = _rows(lab, found)
     if as_json:
-        print(json.dumps(rows))
+        print_json([RigListOutput.model_validate(row) for row in rows])
         return
     table = Table("rig", "address", "simulation", "edge", "source")
     for row in rows:
@@ -147,6 +149,8 @@ def codes(
     from rich.table import Table
 
     from hilrig_classroom.slot_codes import codes_csv, issue_codes, parse_end, select_students
+    from hilrig_cli.json_output.lab import RigCodesOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.claim_codes import replace_private_file
     from hilrig_runtime.config.lab import load_lab
@@ -164,7 +168,7 @@ def codes(
         except OSError as error:
             raise OperationError(f"{out}: can't be written: {error.strerror}") from error
     if as_json:
-        print(json.dumps({"until": ends.isoformat(), "codes": made}))
+        print_json(RigCodesOutput(until=ends.isoformat(), codes=made))
         return
     table = Table(
         "id", "name", "group", "rig", "code", title=f"codes until {ends:%Y-%m-%d %H:%M}", title_justify="left"

@@ -142,8 +142,10 @@ def _measured(
 
 
 def _print_json(folder: Path, entries: "list[RunEntry]", total: int) -> None:
-    import json
     from dataclasses import asdict
+
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import ListedRun, RunsOutput
 
     runs = []
     for entry in entries:
@@ -152,8 +154,8 @@ def _print_json(folder: Path, entries: "list[RunEntry]", total: int) -> None:
         values["segments"] = [str(folder / path) for path in entry.paths]
         values["path"] = str(folder / entry.path)
         values["start"] = _date(entry.start_wall_ns, "%Y-%m-%dT%H:%M:%SZ")
-        runs.append(values)
-    print(json.dumps({"folder": str(folder), "total": total, "runs": runs}, indent=2))
+        runs.append(ListedRun.model_validate(values))
+    print_json(RunsOutput(folder=str(folder), total=total, runs=runs))
 
 
 def _date(wall_ns: int, form: str) -> str:

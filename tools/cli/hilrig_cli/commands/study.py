@@ -1,6 +1,5 @@
 """`hilrig study`: stability of a controller under delay, jitter and loss."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,7 +53,10 @@ def study(
         raise InputError("STUDY.TOML or --from RUN.MCAP is required; see examples/studies for an example")
     results = _sweep(file, controller or [], out, live, console)
     if as_json:
-        print(json.dumps(results))
+        from hilrig_cli.json_output.model import print_json
+        from hilrig_cli.json_output.study import StudyOutput
+
+        print_json(StudyOutput.model_validate(results))
     else:
         _print_results(results, out)
     if any(not point["as_predicted"] for point in results.get("live", [])):
@@ -164,6 +166,8 @@ def _ms(seconds: float | None) -> str:
 
 
 def _from_recording(path: Path, file: Path | None, as_json: bool, console: "TerminalConsole") -> None:
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.study import StudyFromOutput
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.paths import find_run
     from hilrig_replay.io.run import open_run
@@ -174,7 +178,7 @@ def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Term
     with console.status("evaluating gains"), isolated(path):
         evaluation = evaluate_gains(open_run(find_run(path)), study).as_dict()
     if as_json:
-        print(json.dumps(evaluation))
+        print_json(StudyFromOutput.model_validate(evaluation))
     else:
         _print_gains(evaluation)
     if not any(gain["stable"] for gain in evaluation["gains"]):

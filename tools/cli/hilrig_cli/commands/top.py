@@ -1,6 +1,5 @@
 """`hilrig top`: current status of the lab's services and rigs."""
 
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence, Set
@@ -61,6 +60,8 @@ def top(
     """
     from rich.live import Live
 
+    from hilrig_cli.json_output.lab import TopOutput
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_monitoring.lab_watch import LabWatch
     from hilrig_runtime.config.lab import load_lab
@@ -72,7 +73,7 @@ def top(
         if as_json or once or not sys.stdout.isatty():
             with watch.lock:
                 if as_json:
-                    print(json.dumps({"lab": lab.name} | watch.view.as_dict(time.monotonic())))
+                    print_json(TopOutput.model_validate({"lab": lab.name} | watch.view.as_dict(time.monotonic())))
                 else:
                     console.print(
                         render(watch.view, time.monotonic(), None, console.width if sys.stdout.isatty() else None)

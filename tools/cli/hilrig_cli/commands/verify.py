@@ -1,6 +1,5 @@
 """`hilrig verify`: re-simulates recordings and compares every state."""
 
-import json
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -32,6 +31,8 @@ def verify(
     """
     from rich.text import Text
 
+    from hilrig_cli.json_output.model import print_json
+    from hilrig_cli.json_output.recordings import VerifyOutput, VerifyRunsOutput
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
@@ -63,7 +64,10 @@ def verify(
             style = "green" if verification.same else "red"
             console.print(Text(f"{path.name}: {verification.sentence()}", style=style), soft_wrap=True)
     if as_json:
-        plain = [each.as_dict() for each in verifications]
-        print(json.dumps(plain[0] if len(found) == 1 else {"runs": plain, "unreadable": unreadable}))
+        every = [each.as_dict() for each in verifications]
+        if len(found) == 1:
+            print_json(VerifyOutput.model_validate(every[0]))
+        else:
+            print_json(VerifyRunsOutput.model_validate({"runs": every, "unreadable": unreadable}))
     if unreadable or not all(each.same for each in verifications):
         raise typer.Exit(1)

@@ -196,7 +196,7 @@ def check_services(
         if health.lost_transport or health.lost_recorder:
             lost = health.lost_transport + health.lost_recorder
             text = f"{name}: {lost} messages lost since its start"
-            yield CheckResult.warning("services", text, "see 'Sizing' in docs/operations.md")
+            yield CheckResult.warning("services", text, "see docs/sizing.md")
 
 
 def _unserved_rigs(lab: LabConfig, service: str, snapshot: BusSnapshot) -> list[str]:

@@ -28,7 +28,7 @@ class Stage:
 
     @property
     def formula(self) -> str:
-        """Sum of the fields, as in docs/recordings.md."""
+        """Sum of the fields, as in docs/export.md."""
         return " − ".join((" + ".join(self.added), *self.subtracted))
 
 
