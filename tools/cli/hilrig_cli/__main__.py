@@ -45,7 +45,7 @@ def _command() -> int:
 
 
 def _usage_text(error: "typer.BadParameter") -> str:
-    """Return a usage error as one line: option or argument, the value found, what is accepted, and the help."""
+    """Return a usage error as one line: option or argument, value found, accepted values, and the help."""
     from pydantic import ValidationError
 
     from hilrig_runtime.config.validation import format_validation_error

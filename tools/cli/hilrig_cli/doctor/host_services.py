@@ -1,4 +1,4 @@
-"""The services that this host need not run, so that it is not judged by what they need."""
+"""The services that this host need not run; it is not checked for their needs."""
 
 import platform
 import socket
