@@ -39,7 +39,7 @@ def play(
     name = rig or opened.rig
     if not is_name(name) or name in RESERVED_RIG_NAMES:
         raise InputError(f"--rig: {name!r} is not a valid rig name")
-    player = Player(opened.file, speed=speed, start_s=start, loop=loop)
+    player = Player(opened, speed=speed, start_s=start, loop=loop)
     stopping = stop_on_signals()
     with _bus(lab, name) as bus:
         bus.declare_queryable(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
