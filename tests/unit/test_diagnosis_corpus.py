@@ -39,7 +39,7 @@ def test_a_sample_of_forty_runs_is_diagnosed() -> None:
 @pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
 @pytest.mark.timeout(900)
 def test_error_rate_of_the_complete_corpus() -> None:
-    results = list(diagnosed(corpus("judged", RUNS)))
+    results = list(diagnosed(corpus("judged", RUNS), by_cause=True))
     print(table(results))
     disturbed = [one for one in results if one.case.code != UNDISTURBED]
     undisturbed = [one for one in results if one.case.code == UNDISTURBED]
