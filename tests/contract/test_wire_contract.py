@@ -22,7 +22,7 @@ from hilrig_schemas import RigConfig
 from support.recorder_rig import metadata
 from wire_contract import Contract
 
-FROZEN_0_2_0 = "dab871750ad259517a019de0169ba8bb90cd6c01795b601c152a1ddec6f9a0bb"
+FROZEN_0_2_0 = "b417cabc5486798d9530f1935bf7ae86ec3a315a32af621414d20dc8414fd801"
 STATE = "hilrig.v1.JointState"
 
 
