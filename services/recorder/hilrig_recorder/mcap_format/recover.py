@@ -188,6 +188,8 @@ def _locked(source: Path) -> Iterator[None]:
     """Lock a file against other processes that write or recover it."""
     try:
         file = open_file(source, is_writable=True)
+    except FileNotFoundError:
+        raise InputError(f"{source}: no such file") from None
     except PermissionError:
         # Without write permission the file can still be read, and no recorder of this user writes it.
         yield

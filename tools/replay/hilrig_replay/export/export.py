@@ -70,6 +70,8 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
                     rows = rows_of(block)
                     if len(rows):
                         writers[name].write_table(table(run, rows, escape))
+    except FileExistsError as error:
+        raise OperationError(f"{folder}: expected a folder, found a file") from error
     except OSError as error:
         raise OperationError(f"{folder}: can't be written: {error.strerror or error}") from error
     return list(paths.values())
