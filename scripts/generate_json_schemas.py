@@ -41,7 +41,7 @@ error. Every object has the key `schema` with the name and the version of its sc
 keys to a version; a key that is removed or renamed, or whose type or meaning changes, needs a new version. NaN and
 infinity do not occur: a value that does not exist is null. Exit codes are the same as without `--json`.
 
-The schemas are JSON Schema, draft 2020-12, in the folder [json](json/). This page is generated from them by `make gen`.
+The schemas are JSON Schema, draft 2020-12, in `docs/json/`. This page is generated from them by `make gen`.
 """
 
 
