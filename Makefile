@@ -75,7 +75,6 @@ check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
-	MYPYPATH=tests:scripts:bench $(BIN)/mypy bench/*.py examples/*.py examples/controllers/*.py
 	$(BIN)/python scripts/check_vocabulary.py
 
 gen: .venv/dev ## generate code and documentation tables from their sources

@@ -107,8 +107,8 @@ def _kind(field: dict[str, Any]) -> str:
         case "array":
             return f"array: {_kind(field.get('items', {}))}"
         case "object":
-            inner = field.get("additionalProperties")
-            return f"object: {_kind(inner)}" if isinstance(inner, dict) else "object"
+            values = field.get("additionalProperties")
+            return f"object: {_kind(values)}" if isinstance(values, dict) else "object"
         case str(kind):
             return kind
     return "any"
@@ -135,7 +135,7 @@ def _is_described(name: str, schema: dict[str, Any]) -> bool:
 def _config_types() -> frozenset[str]:
     """Return the names of the types that are tables of a configuration file."""
 
-    def below(base: type) -> Iterator[str]:
+    def below(base: type[Section]) -> Iterator[str]:
         for one in base.__subclasses__():
             yield one.__name__
             yield from below(one)

@@ -1,7 +1,8 @@
-"""The compatibility contract between versions, in `schemas/contract.txt`; `make gen` adds new entries.
+"""The compatibility contract between versions, in `schemas/contract.txt`: frozen entries, then those added since.
 
-An entry is a property on which a reader of another version relies: a field's number, name and type, an enum's values,
-a topic's key and message. Pure functions on descriptors, so that tests can check that each violation is detected.
+An entry is a property on which another version, a controller or a reader of recordings relies: a field's number, name
+and type, an enum's values, a topic's key and message, a register's number and type, a metadata record's key. Frozen
+entries are part of a release. Pure functions on descriptors, so that tests can check that each violation is detected.
 """
 
 import importlib
@@ -19,13 +20,15 @@ from google.protobuf.descriptor_pb2 import (
 )
 
 import hilrig_schemas.v1
+from hilrig_modbus_edge.registers.map import MAP, Register, Status
 from hilrig_schemas import topics
 
 PATH = Path(__file__).parents[1] / "schemas/contract.txt"
 HEAD = """\
-# Compatibility contract between versions of hilrig. `make gen` adds new entries; a released entry must not be changed
-# or removed (docs/adr/0042-schema-evolution.md). A removed field stays here and is reserved in its message.
+# Compatibility contract between versions of hilrig (docs/adr/0042-schema-evolution.md). The entries of a release are
+# frozen: no version 0.2.x changes or removes one. `reserved`: removed before the release, never to be used again.
 """
+SINCE = "# Added since version 0.2.0; written by `make gen`\n"
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,7 @@ class Contract:
     """The entries of a set of schemas, and their reserved numbers and names."""
 
     lines: frozenset[str]
-    messages: frozenset[str]
-    reserved: frozenset[tuple[str, str]]
-    """Pairs of message or enum and number, and of message or enum and name."""
+    reserved: frozenset[str]
 
 
 def files() -> list[FileDescriptorProto]:
@@ -52,26 +53,21 @@ def files() -> list[FileDescriptorProto]:
 def contract(schemas: Iterable[FileDescriptorProto]) -> Contract:
     """Return the contract of some schemas."""
     lines: set[str] = set()
-    messages: set[str] = set()
-    reserved: set[tuple[str, str]] = set()
+    reserved: set[tuple[str, int | str]] = set()
     for file in schemas:
         enums = list(_all_enums(file.package, file.enum_type))
         for name, message in _all_messages(file.package, file.message_type):
-            messages.add(name)
             lines.update(f"field {name} {field.number} {field.name} {_type(field)}" for field in message.field)
             enums += _all_enums(name, message.enum_type)
-            reserved.update(
-                (name, str(number)) for span in message.reserved_range for number in range(span.start, span.end)
-            )
+            reserved.update((name, number) for span in message.reserved_range for number in range(span.start, span.end))
             reserved.update((name, text) for text in message.reserved_name)
         for name, enum in enums:
             lines.update(f"enum {name} {value.number} {value.name}" for value in enum.value)
             # The last number of an enum's range is inclusive, unlike that of a message.
-            reserved.update(
-                (name, str(number)) for span in enum.reserved_range for number in range(span.start, span.end + 1)
-            )
+            spans = [range(span.start, span.end + 1) for span in enum.reserved_range]
+            reserved.update((name, number) for span in spans for number in span)
             reserved.update((name, text) for text in enum.reserved_name)
-    return Contract(frozenset(lines), frozenset(messages), frozenset(reserved))
+    return Contract(frozenset(lines), frozenset(f"reserved {name} {what}" for name, what in reserved))
 
 
 def topic_lines() -> Iterator[str]:
@@ -86,37 +82,47 @@ def topic_lines() -> Iterator[str]:
     yield f"alive {topics.alive_key('<lab>', '<service>', '<instance>')}"
 
 
+def register_lines(registers: Iterable[Register] = MAP) -> Iterator[str]:
+    """Yield the entries of the register map."""
+    for one in registers:
+        access = "writable" if one.writable else "read-only"
+        table = one.table.name.lower()
+        yield f"register {table} {one.number} {one.name} {one.type.name.lower()} {one.unit or '-'} {one.scale} {access}"
+    for flag in Status:
+        yield f"status {flag.bit_length() - 1} {flag.name}"
+
+
 def violations(entries: Iterable[str], now: Contract) -> list[str]:
     """Return the violated entries, each with a human-readable reason."""
-    return [f"{line}: {reason}" for line in sorted(entries) if (reason := _violation(line, now))]
+    return [f"{line}: {_reason(line, now)}" for line in sorted(entries) if line not in now.lines | now.reserved]
 
 
-def _violation(line: str, now: Contract) -> str:
-    if line in now.lines:
-        return ""
-    kind, owner, *rest = line.split(" ")
-    if kind not in ("field", "enum"):
-        return "changed or removed"
-    if kind == "field" and owner not in now.messages:
-        # Messages that are used are covered by the entries of topics and fields.
-        return ""
-    number, name, *_ = rest
-    changed = [other for other in now.lines if other.split(" ")[:3] == [kind, owner, number]]
-    if changed:
-        return f"is now {changed[0]}"
-    missing = [text for text in (number, f'"{name}"') if (owner, text.strip('"')) not in now.reserved]
-    return f"removed: reserve {' and '.join(missing)}" if missing else ""
+def _reason(line: str, now: Contract) -> str:
+    number_of = {"field": 3, "enum": 3, "register": 3, "status": 2}
+    same = line.split(" ")[: number_of.get(line.split(" ")[0], 0)]
+    changed = [other for other in now.lines if same and other.split(" ")[: len(same)] == same]
+    return f"is now {changed[0]}" if changed else "removed"
 
 
-def recorded_entries() -> set[str]:
-    """Return the entries of the file."""
-    return {line for line in PATH.read_text().splitlines() if line and not line.startswith("#")}
+def recorded_entries() -> tuple[set[str], set[str]]:
+    """Return the frozen entries of the file, and those added since."""
+    frozen, _, added = PATH.read_text(encoding="utf-8").partition(SINCE)
+    return _entries(frozen), _entries(added)
+
+
+def _entries(text: str) -> set[str]:
+    return {line for line in text.splitlines() if line and not line.startswith("#")}
+
+
+def is_metadata(line: str) -> bool:
+    """Return whether an entry is the key of a metadata record, which only a recording shows."""
+    return line.startswith("metadata ")
 
 
 def current() -> Contract:
-    """Return the contract of this version, including topics."""
+    """Return the contract of this version without the metadata of recordings."""
     found = contract(files())
-    return Contract(found.lines | frozenset(topic_lines()), found.messages, found.reserved)
+    return Contract(found.lines | {*topic_lines(), *register_lines()}, found.reserved)
 
 
 def _all_messages(package: str, messages: Iterable[DescriptorProto]) -> Iterator[tuple[str, DescriptorProto]]:
@@ -137,20 +143,23 @@ def _type(field: FieldDescriptorProto) -> str:
     return repeated + (field.type_name.removeprefix(".") or plain)
 
 
-def _order(line: str) -> tuple[str, str, int]:
+def _order(line: str) -> tuple[str, str, int, str]:
     kind, owner, *rest = line.split(" ")
-    return kind, owner, int(rest[0]) if rest and rest[0].isdecimal() else 0
+    return kind, owner, int(rest[0]) if rest and rest[0].isdecimal() else 0, line
 
 
 def main() -> int:
-    """Add new entries to the file; exit code 1: an entry is violated."""
-    old, now = recorded_entries() if PATH.exists() else set(), current()
-    violated = violations(old, now)
+    """Write the entries added since the release to the file; exit code 1: a frozen entry is violated."""
+    frozen, _ = recorded_entries()
+    now = current()
+    violated = violations((line for line in frozen if not is_metadata(line)), now)
     for text in violated:
         print(f"{PATH.name}: {text}", file=sys.stderr)
-    if not violated:
-        PATH.write_text(HEAD + "".join(f"{line}\n" for line in sorted(old | now.lines, key=_order)))
-    return 1 if violated else 0
+    if violated:
+        return 1
+    parts = [HEAD, *(f"{line}\n" for line in sorted(frozen, key=_order)), SINCE]
+    PATH.write_text("".join([*parts, *(f"{line}\n" for line in sorted(now.lines - frozen, key=_order))]), "utf-8")
+    return 0
 
 
 if __name__ == "__main__":

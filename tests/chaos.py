@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -300,26 +300,31 @@ def check_reports(faults: list[Fault], recorded: Recorded, logs: dict[str, str])
         )
 
     for fault in faults:
-        what = fault.kind, fault.host
-        expected: dict[tuple[str, str], Callable[[], bool]] = {
-            ("kill", "sim"): lambda fault=fault: has(fault, Event.STATE_LOST),
-            ("stop", "sim"): lambda fault=fault: (
-                has(fault, Event.STATE_LOST) and has(fault, Event.OVERRUN, "simulation")
-            ),
-            ("cut", "sim"): lambda fault=fault: has(fault, Event.STATE_LOST) and has(fault, Event.COMMAND_LOST),
-            ("kill", "edge"): lambda fault=fault: has(fault, Event.COMMAND_LOST),
-            ("stop", "edge"): lambda fault=fault: (
-                has(fault, Event.COMMAND_LOST) and has(fault, Event.OVERRUN, "the edge")
-            ),
-            ("cut", "edge"): lambda fault=fault: has(fault, Event.STATE_LOST) and has(fault, Event.COMMAND_LOST),
-            ("kill", "recorder"): lambda: "recovered" in recorded.endings,
-            ("stop", "recorder"): lambda: "stalled for" in logs["recorder"],
-            ("cut", "recorder"): lambda fault=fault: has(fault, Event.RECORDING, "no messages of"),
-            ("cut", "pc"): lambda fault=fault: has(fault, Event.WATCHDOG_TRIP),
-            ("kill", "router"): lambda fault=fault: has(fault, Event.STATE_LOST) and has(fault, Event.COMMAND_LOST),
-            ("slow disk", "recorder"): lambda: "slow disk" in logs["recorder"],
-        }
-        reported = recorded.clock_steps > 0 if fault.kind == "clock" else expected[what]()
+        match fault.kind, fault.host:
+            case "clock", _:
+                reported = recorded.clock_steps > 0
+            case "kill", "sim":
+                reported = has(fault, Event.STATE_LOST)
+            case "stop", "sim":
+                reported = has(fault, Event.STATE_LOST) and has(fault, Event.OVERRUN, "simulation")
+            case "kill", "edge":
+                reported = has(fault, Event.COMMAND_LOST)
+            case "stop", "edge":
+                reported = has(fault, Event.COMMAND_LOST) and has(fault, Event.OVERRUN, "the edge")
+            case ("cut", "sim" | "edge") | ("kill", "router"):
+                reported = has(fault, Event.STATE_LOST) and has(fault, Event.COMMAND_LOST)
+            case "kill", "recorder":
+                reported = "recovered" in recorded.endings
+            case "stop", "recorder":
+                reported = "stalled for" in logs["recorder"]
+            case "cut", "recorder":
+                reported = has(fault, Event.RECORDING, "no messages of")
+            case "slow disk", "recorder":
+                reported = "slow disk" in logs["recorder"]
+            case "cut", "pc":
+                reported = has(fault, Event.WATCHDOG_TRIP)
+            case _:
+                raise AssertionError(f"no report is defined of {fault}")
         if not reported:
             yield f"{fault}: not reported"
 

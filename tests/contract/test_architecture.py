@@ -17,7 +17,8 @@ def subpackages(package: Path) -> set[str]:
 
 
 def described() -> dict[str, set[str]]:
-    rows, package = {}, ""
+    rows: dict[str, set[str]] = {}
+    package = ""
     for line in PAGE.partition("\n## Packages\n")[2].partition("\n## ")[0].splitlines():
         if match := re.match(r"\| (\w*) ?\| `(\w+)` \|", line):
             package = match[1] or package

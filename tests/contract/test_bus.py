@@ -4,13 +4,14 @@ import queue
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 
-from hilrig_runtime.bus.api import Bus
+from hilrig_runtime.bus.api import Bus, Publisher
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
-from hilrig_runtime.config.lab import BusConfig
+from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas.topics import Traffic
 from support.labs import free_ports
@@ -163,15 +164,17 @@ def test_closed_objects_are_silent_and_can_be_closed_again(open_bus: OpenBus) ->
 def test_services_connect_in_any_order_and_after_a_restart() -> None:
     config = BusConfig(first_port=free_ports(3))
     got: list[bytes] = []
+
+    def is_received_twice(publisher: Publisher, payload: bytes) -> bool:
+        publisher.put(payload)
+        return got.count(payload) >= 2
+
     with ZenohBus(config, "recorder") as recorder, ZenohBus(config, "edge") as edge:
         for bus in (recorder, edge):
             bus.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(payload))
         for instance in (b"first", b"second"):
             with ZenohBus(config, "sim") as sim:
-                publisher = sim.publisher("hil/lab/rig1/state", Traffic.CONTROL)
-                eventually(
-                    lambda instance=instance, publisher=publisher: publisher.put(instance) or got.count(instance) >= 2
-                )
+                eventually(partial(is_received_twice, sim.publisher("hil/lab/rig1/state", Traffic.CONTROL), instance))
 
 
 def test_occupied_bus_port_is_reported_in_one_line() -> None:

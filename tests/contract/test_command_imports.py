@@ -3,29 +3,15 @@
 import ast
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import typer
-
 from hilrig_cli import main
+from support.extras import registered
 
 ROOT = Path(__file__).parents[2]
 MODULES = sorted((ROOT / "tools/cli/hilrig_cli/commands").glob("[a-z]*.py"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PANELS = set(main.PANELS)
-
-
-def registered() -> Iterator[tuple[str, str, str | None]]:
-    """Yield module, name and panel of each command, also of groups."""
-    for command in main.app.registered_commands:
-        assert command.callback is not None
-        yield command.callback.__module__, command.name or command.callback.__name__, command.rich_help_panel
-    for group in main.app.registered_groups:
-        assert isinstance(group.typer_instance, typer.Typer)
-        callback = group.typer_instance.registered_commands[0].callback
-        assert callback is not None
-        yield callback.__module__, str(group.name), group.rich_help_panel
 
 
 def test_every_module_is_registered() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from pydantic import BaseModel
 
 from hilrig_cli.commands.impair import impair
 from hilrig_cli.commands.jitter import jitter
@@ -137,7 +138,7 @@ def default(key: str) -> float:
         elif name.isdecimal():
             value = value[int(name)]
         else:
-            value = value.model_fields[name].default if isinstance(value, type) else getattr(value, name)
+            value = TlsConfig.model_fields[name].default if value is TlsConfig else getattr(value, name)
     return float(value)
 
 
@@ -230,10 +231,12 @@ def test_example_controller_knows_the_default_arm_and_scene() -> None:
 def test_every_key_of_the_lab_file_is_used() -> None:
     sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
     text = "".join(path.read_text(encoding="utf-8") for path in sources if not path.stem.endswith("_pb2"))
-    models = [LabConfig, SimConfig, EdgeConfig, TlsConfig, RecorderConfig, BusConfig, BusTlsConfig, RigSettings]
+    models: list[type[BaseModel]] = [LabConfig, SimConfig, EdgeConfig, TlsConfig, RecorderConfig, BusConfig]
+    models += [BusTlsConfig, RigSettings, ArmConfig, SceneConfig, TableConfig, MagnetConfig, PartConfig, TrayConfig]
+    models.append(TaskConfig)
     assert [
         f"{model.__name__}.{key}"
-        for model in [*models, ArmConfig, SceneConfig, TableConfig, MagnetConfig, PartConfig, TrayConfig, TaskConfig]
+        for model in models
         for key in model.model_fields
         if not re.search(rf"\.{key}\b", text)
     ] == []

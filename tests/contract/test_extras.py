@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_command_imports import registered
 
 from hilrig_cli import extras
-from support.extras import COMMANDS, DATA, MODULES, PROJECT, ROOT, distributions_of, modules_without
+from support.extras import COMMANDS, DATA, MODULES, PROJECT, ROOT, distributions_of, modules_without, registered
 
 OLD_NAMES = {"router", "sim", "edge", "recorder", "replay"}
 """Extras of version 0.1, which remain as aliases."""

@@ -1,5 +1,6 @@
 """The JSON output of the commands: every command has a published schema, and each version keeps its fields."""
 
+import ast
 import copy
 import json
 from collections.abc import Iterator
@@ -12,7 +13,9 @@ from typer.main import get_command
 import generate_json_schemas as generator
 from hilrig_cli.json_output import catalog
 from hilrig_cli.main import app
+from support.json_output import command_of
 
+ROOT = Path(__file__).parents[2]
 FILES = sorted(generator.FOLDER.iterdir())
 
 
@@ -43,6 +46,18 @@ def test_every_command_with_json_has_a_schema() -> None:
     }
     assert len(found) > 20
     assert found == set(catalog.OUTPUTS)
+
+
+def test_every_json_output_is_checked_in_a_run() -> None:
+    # `hilrig` and `hilrig_in_process` compare each JSON output with its published schema.
+    checked = set()
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("hilrig", "hilrig_in_process"):
+                arguments = [str(one.value) for one in node.args if isinstance(one, ast.Constant)]
+                if "--json" in arguments:
+                    checked.add(command_of(arguments))
+    assert checked == set(catalog.OUTPUTS)
 
 
 def test_published_schemas_and_page_are_up_to_date() -> None:

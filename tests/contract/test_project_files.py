@@ -7,6 +7,7 @@ from pathlib import Path
 import yaml
 
 ROOT = Path(__file__).parents[2]
+COMPOSE = [ROOT / "compose.yaml", ROOT / "compose/secure.yaml"]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -14,10 +15,18 @@ def test_citation_names_version_license_and_paper() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["cff-version"] == "1.2.0"
     assert citation["authors"] == [{"name": "The hilrig authors"}]
-    assert PROJECT["version"].removesuffix(".dev0") == citation["version"]
+    assert citation["version"] == PROJECT["version"]
     assert citation["license"] == PROJECT["license"]
     (paper,) = citation["references"]
     assert f"https://doi.org/{paper['doi']}" in (ROOT / "README.md").read_text()
+
+
+def test_version_and_date_are_those_of_the_newest_release() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    releases = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert releases[0] == (PROJECT["version"], str(citation["date-released"]))
+    images = {service["image"] for file in COMPOSE for service in yaml.safe_load(file.read_text())["services"].values()}
+    assert images == {f"hilrig:{PROJECT['version']}"}
 
 
 def test_notice_names_vendored_files() -> None:

@@ -47,7 +47,12 @@ def move(start: np.ndarray, goal: np.ndarray, seconds: float) -> Reference:
 def line(start: Sequence[float], goal: Sequence[float], seconds: float, elbow: int = 1) -> Reference:
     """Straight motion of the tool between two points, mm."""
     begin, way = np.array(start, float), np.subtract(goal, start)
-    return lambda t: joints_for(*(begin + smooth(t / seconds) * way), elbow=elbow)
+
+    def reference(t: float) -> np.ndarray:
+        x, y, z = begin + smooth(t / seconds) * way
+        return joints_for(x, y, z, elbow=elbow)
+
+    return reference
 
 
 def efforts(q: np.ndarray, v: np.ndarray, a: np.ndarray, held: float) -> tuple[np.ndarray, np.ndarray]:
@@ -64,6 +69,7 @@ class Arm:
     """The arm behind its registers; `delay`: known additional delay of the loop, s, `rate`: of the feedback, 1/s."""
 
     def __init__(self, delay: float = 0.0, rate: float = 6.0) -> None:
+        self._goal: np.ndarray | None = None
         parser = argparse.ArgumentParser()
         parser.add_argument("--host", default="127.0.0.1")
         parser.add_argument("--port", type=int, default=5020)
@@ -100,20 +106,21 @@ class Arm:
 
     def move(self, goal: np.ndarray, seconds: float, rest: float = 0.6) -> None:
         """Move the joints to a position, and rest there."""
-        start = self._goal if hasattr(self, "_goal") else self.q
+        start = self.q if self._goal is None else self._goal
         self._goal = goal
         self.follow(move(start, goal, seconds), seconds + rest)
 
     def line(self, start: Sequence[float], goal: Sequence[float], seconds: float, rest: float = 0.1) -> None:
         """Move the tool straight from one point to another one, mm."""
-        self._goal = joints_for(*goal)
+        x, y, z = goal
+        self._goal = joints_for(x, y, z)
         self.follow(line(start, goal, seconds), seconds + rest)
 
     def magnet(self, on: bool, held: float = 0.0) -> None:
         """Switch the magnet, and wait; `held` is the mass that it holds then, kg."""
         self._client.write_coil(0, on)
         self._held = held
-        self.move(self._goal, 0.1, rest=0.2 + self._delay)
+        self.move(self.q if self._goal is None else self._goal, 0.1, rest=0.2 + self._delay)
 
     def close(self) -> None:
         """Zero the torques and disconnect."""

@@ -74,7 +74,12 @@ def test_first_signal_stops_in_order(tmp_path: Path, number: signal.Signals) -> 
 def test_second_signal_forces_exit(tmp_path: Path) -> None:
     process = start(tmp_path, "ignoring_stop", timeout=60)
     process.terminate()
-    eventually(lambda: process.poll() is not None or process.terminate())
+
+    def has_exited() -> bool:
+        process.terminate()
+        return process.poll() is not None
+
+    eventually(has_exited)
     assert process.wait() == 128 + signal.SIGTERM
     process.communicate()
 

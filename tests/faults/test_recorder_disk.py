@@ -92,8 +92,7 @@ def test_full_disk_finishes_files_and_recording_resumes(tmp_path: Path) -> None:
                     senders.begin(rig)
                 eventually(lambda: all(holds_messages(lab, rig) for rig in rigs))
                 fill(ballast)
-                for rig in rigs:
-                    eventually(lambda rig=rig: files_of(lab, rig))
+                eventually(lambda: all(files_of(lab, rig) for rig in rigs))
                 eventually(lambda: any("No space left" in text for text in alerts.received))
                 full = {rig: files_of(lab, rig)[0] for rig in rigs}
                 for rig in rigs:
@@ -107,13 +106,11 @@ def test_full_disk_finishes_files_and_recording_resumes(tmp_path: Path) -> None:
                 eventually(lambda: senders.count(rigs[0]) > sent + 300)
                 ballast.unlink()
                 # Recording is retried ten seconds after the failure.
-                for rig in rigs:
-                    eventually(lambda rig=rig: files_of(lab, rig, "*.part"))
+                eventually(lambda: all(files_of(lab, rig, "*.part") for rig in rigs))
                 eventually(lambda: alerts.received and not alerts.received[-1])
                 for rig in rigs:
                     senders.end(rig)
-                for rig in rigs:
-                    eventually(lambda rig=rig: len(files_of(lab, rig)) == 2)
+                eventually(lambda: all(len(files_of(lab, rig)) == 2 for rig in rigs))
             finally:
                 alerts.close()
         for rig in rigs:

@@ -77,8 +77,7 @@ def test_kill_9_at_random_times_loses_no_messages(tmp_path: Path) -> None:
             lives.append(Life(now_s(), float("inf"), 0, 0))
             for rig in rigs:
                 senders.end(rig)
-            for rig in rigs:
-                eventually(lambda rig=rig: files_of(lab, rig) and not files_of(lab, rig, "*.part"))
+            eventually(lambda: all(files_of(lab, rig) and not files_of(lab, rig, "*.part") for rig in rigs))
     for rig in rigs:
         paths = files_of(lab, rig)
         found = recorded(paths)

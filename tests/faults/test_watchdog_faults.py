@@ -10,8 +10,10 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
+from google.protobuf.message import Message
 from mcap.reader import make_reader
 
 from hilrig_schemas import Event, JointState, TorqueCommand
@@ -20,6 +22,7 @@ from support.namespaces import Network, require_namespaces
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
+MessageT = TypeVar("MessageT", bound=Message)
 TOLERANCE_MS = 1000
 """Other processes may take the processors for some time, ms; with a clock of its own: tests/unit/test_device.py."""
 
@@ -47,7 +50,7 @@ def controller(port: int, mode: str = "writes", host: str = "127.0.0.1") -> list
     return [sys.executable, "-c", CONTROLLER, host, str(port), mode]
 
 
-def messages(path: Path, topic: str, kind: type) -> list:  # type: ignore[type-arg]
+def messages(path: Path, topic: str, kind: type[MessageT]) -> list[MessageT]:
     with path.open("rb") as file:
         return [kind.FromString(message.data) for _, _, message in make_reader(file).iter_messages(topics=[topic])]
 
@@ -153,7 +156,7 @@ def test_torque_is_zero_after_network_failure(tmp_path: Path) -> None:
 
         def status() -> dict[str, object]:
             asked = network.run("rig", [*HILRIG, "lease", "rig1", "--json", "--config", str(lab)], capture_output=True)
-            return json.loads(asked.stdout)  # type: ignore[no-any-return]
+            return json.loads(asked.stdout)
 
         eventually(lambda: tripped(status()))
         up.send_signal(signal.SIGTERM)

@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -263,9 +264,9 @@ def test_services_connect_by_name_and_controllers_move_arms(containers: Containe
         return (before, after) if after != before else None
 
     for edge, port in (("east", 5020), ("west", 5023)):
-        before, after = eventually(lambda edge=edge, port=port: drive(edge, port), timeout_s=90, every_s=0.2)
+        before, after = eventually(partial(drive, edge, port), timeout_s=90, every_s=0.2)
         assert after > before
-    assert all(eventually(lambda name=name: containers.is_healthy(name)) for name in SERVICES)
+    eventually(lambda: all(containers.is_healthy(name) for name in SERVICES))
 
     password = re.search(r"password: (\S+)", (folder / "console.log").read_text())
     assert password is not None
@@ -369,7 +370,7 @@ def test_services_run_in_their_order_and_the_demo_records(volumes: Volumes) -> N
         def healthy(name: str) -> bool:
             return network.call(name, volumes.local(name, {"command": RUNNING[name]["healthcheck"]["test"][1:]})) == 0
 
-        assert all(eventually(lambda name=name: healthy(name), timeout_s=90) for name in RUNNING)
+        eventually(lambda: all(healthy(name) for name in RUNNING), timeout_s=90)
         command = [*volumes.local("demo", services["demo"]), "3"]
         driven = network.run(
             "demo", command, check=False, env=environment(), capture_output=True, text=True, timeout=LONG_TIMEOUT_S

@@ -104,8 +104,7 @@ def test_mesh_accepts_only_certificates_of_the_lab(lab: Lab, tmp_path: Path, def
         ZenohBus(lab.config(lab.folder, "mesh"), "edge") as edge,
         ZenohBus(lab.config(lab.folder, "mesh"), "tool") as tool,
     ):
-        for service in (edge, tool):
-            eventually(lambda service=service: service.session.zid() in sim.session.info.peers_zid())
+        eventually(lambda: {edge.session.zid(), tool.session.zid()} <= set(sim.session.info.peers_zid()))
         assert untrusted.session.zid() not in sim.session.info.peers_zid()
         assert untrusted.session.info.peers_zid() == []
 

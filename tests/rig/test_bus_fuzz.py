@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,7 @@ from hilrig_schemas.topics import (
     SERVICE_INFO,
     STATE,
     STATES,
+    Topic,
     alive_key,
 )
 from support.bus_certificates import make_bus_folder
@@ -58,7 +60,7 @@ class Fuzzer:
         self.bus = bus
         self.rng = rng
         self.rig = rig
-        keys = [(topic, topic.key(LAB, rig)) for topic in (*RECORDED.values(),)]
+        keys: list[tuple[Topic[Any], str]] = [(topic, topic.key(LAB, rig)) for topic in RECORDED.values()]
         self.forged = bus.publisher(RECORDED["command"].key(LAB, "rig1"), RECORDED["command"].traffic).put
         keys += [(HEALTH, HEALTH.key(LAB, "edge", "west")), (EVENT, EVENT.key(LAB, "edge"))]
         self.publishers = [(topic.message, bus.publisher(key, topic.traffic).put) for topic, key in keys]

@@ -7,9 +7,10 @@ tables below list the permitted keys; they are independent of the rules in the p
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 
-EDGES = {"east": ("rig1",), "west": ("rig2",)}
+EDGES: dict[str, tuple[str, ...]] = {"east": ("rig1",), "west": ("rig2",)}
 NAMES = ["router", "sim", *EDGES, "recorder", "operator", "viewer", "student"]
 CASES = [("router", name) for name in NAMES[1:]] + [
     ("mesh", name) for name in ("sim", "east", "recorder", "operator", "student")
@@ -217,6 +218,10 @@ def test_certificate_permits_only_its_own_keys(folder: Path, topology: str, name
 @pytest.mark.parametrize("topology", ["router", "mesh"])
 def test_open_rules_permit_every_key(folder: Path, topology: str) -> None:
     with connected_sessions(folder, topology, "student", "") as sessions:
+
+        def is_permitted(tried: Callable[[Sessions], set[str]], wanted: set[str]) -> bool:
+            return tried(sessions) >= wanted
+
         for tried, everything in (
             (keys_sent, SENT),
             (tokens_seen, TOKENS),
@@ -224,9 +229,8 @@ def test_open_rules_permit_every_key(folder: Path, topology: str) -> None:
             (keys_queried, QUERIED),
             (keys_answered, QUERIED),
         ):
-            eventually(
-                lambda tried=tried, everything=everything: tried(sessions) >= set(everything) - {"alive/recorder/1"}
-            )
+            wanted = set(everything) - {"alive/recorder/1"}
+            eventually(partial(is_permitted, tried, wanted))
 
 
 def keys_sent(sessions: Sessions) -> set[str]:

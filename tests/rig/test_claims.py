@@ -66,8 +66,11 @@ def test_rigs_are_written_by_those_who_claimed_them(tmp_path: Path) -> None:
         with subprocess.Popen(server, stdout=subprocess.DEVNULL) as program:
             try:
                 eventually(lambda: "rig2 is not claimed: claim it" in lease("rig2")["controller_fault"])
-                wrong = hilrig("claim", codes["s1002"], f"127.0.0.1:{ports['rig1']}")
-                assert (wrong.returncode, "is not valid for this rig" in wrong.stdout) == (1, True)
+                wrong = hilrig("claim", codes["s1002"], f"127.0.0.1:{ports['rig1']}", "--json")
+                assert (wrong.returncode, "is not valid for this rig" in json.loads(wrong.stdout)["reason"]) == (
+                    1,
+                    True,
+                )
                 for number, code in enumerate(codes.values(), start=1):
                     claimed = hilrig("claim", code.lower().replace("-", ""), f"rig{number}", "-c", config)
                     assert (claimed.returncode, "is yours until the end" in claimed.stdout) == (0, True), claimed

@@ -35,7 +35,7 @@ def test_latency_equals_the_result_of_hilrig_latency(demo: tuple[Path, dict[str,
     _, result = demo
     again = hilrig("latency", result["recording"], "--json")
     latency = json.loads(again.stdout)
-    assert latency == result["latency"]
+    assert latency == {"schema": "hilrig.latency/1", **result["latency"]}
     assert {"samples", "loop_ms", "stages_ms", "step_ms", "lost", "fit", "reasons"} <= set(latency)
     assert set(latency["lost"]) == {"transport", "recorder", "file"}
     assert set(latency["stages_ms"]) == set(STAGES)

@@ -102,7 +102,7 @@ def test_controller_of_the_front_page_reaches_its_goal(tmp_path: Path) -> None:
     assert len(program.splitlines()) <= 15
     with RunningLab(write_lab(tmp_path)) as lab:
         (tmp_path / "first.py").write_text(program.replace("port=5020", f"port={lab.port}"))
-        command = [sys.executable, tmp_path / "first.py"]
+        command = [sys.executable, str(tmp_path / "first.py")]
         done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
     angle = re.fullmatch(r"joint 1 is at (\S+) degrees\n", done.stdout)
     assert angle is not None

@@ -75,8 +75,8 @@ def test_live_events_and_commands_for_several_rigs(tmp_path: Path) -> None:
         nothing = hilrig("record", "stop", "--config", config)
         assert nothing.returncode == 2
         assert "no rig given; expected names of rigs, or --all" in nothing.stderr
-        stopped = hilrig("record", "stop", "rig1", "rig2", "--config", config)
-        assert len(stopped.stdout.splitlines()) == 2, stopped.stderr
+        stopped = hilrig("record", "stop", "rig1", "rig2", "--json", "--config", config)
+        assert [row["rig"] for row in json.loads(stopped.stdout)] == ["rig1", "rig2"], stopped.stderr
         seen: list[str] = []
 
         def has_ended() -> bool:

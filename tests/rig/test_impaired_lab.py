@@ -143,7 +143,7 @@ def sessions(statuses: dict[str, Any], lab_folder: Path) -> dict[str, Session]:
 
 def assert_stages_add_up(session: Session) -> None:
     table = session.report.table
-    assert (sum(table[stage] for stage in STAGES) == table["loop"]).all()
+    assert np.array_equal(sum(table[stage] for stage in STAGES), table["loop"])
     for stage in STAGES:
         assert (table[stage] >= 0).all(), stage
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from support.extras import COMMANDS, DATA, ROOT
+from support.extras import COMMANDS, DATA, PROJECT, ROOT
 from support.labs import free_ports, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
@@ -34,6 +34,7 @@ def test_extra_alone_runs_its_commands(extra: str, tmp_path: Path) -> None:
     installed = run(tmp_path / "venv/bin/pip", "install", *options, folder, cwd=tmp_path)
     assert installed.returncode == 0, installed.stderr
     hilrig = tmp_path / "venv/bin/hilrig"
+    assert run(hilrig, "--version", cwd=tmp_path).stdout == f"hilrig {PROJECT['version']}\n"
     (tmp_path / "out").mkdir()
     places = {"root": ROOT, "data": shutil.copytree(DATA, tmp_path / "data"), "out": tmp_path / "out"}
     for command in COMMANDS[extra]:

@@ -163,6 +163,16 @@ def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tup
     assert done.stderr.endswith("hilrig: error: unknown rig 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
+def test_live_without_a_display_is_reported_as_in_replay(lab: RunningLab, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    recording = Path(__file__).parents[1] / "data/limit-cycle.mcap"
+    live, replay = hilrig("live", "--config", lab.config), hilrig("replay", recording)
+    assert (live.returncode, replay.returncode) == (3, 3)
+    assert live.stderr == replay.stderr
+    assert "needs a display; without one use --save or --web" in live.stderr
+
+
 def test_duplicate_rig_is_rejected() -> None:
     done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=LONG_TIMEOUT_S)
     assert (done.returncode, done.stdout) == (2, "")

@@ -77,7 +77,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[st
             pytest.skip("needs node and npm (Debian's packages nodejs and npm)")
         output, _ = running[library].communicate(timeout=120)
         if running[library].returncode:
-            pytest.skip(f"{running[library].args[0]} can't install {library} here: {output.strip().splitlines()[-1:]}")
+            pytest.skip(f"{commands[library][0]} can't install {library} here: {output.strip().splitlines()[-1:]}")
         return folders[library]
 
     yield functools.cache(wait)
@@ -261,4 +261,5 @@ def test_plc_project_uses_existing_registers() -> None:
         assert count == len(re.findall(r"AT %QW10[0-3] : INT;", program))
         assert client.ask("0F 00 00 00 01 01 01").hex() == "0f00000001"
         assert config["Coils_Size"] == "1" and "AT %QX100.0 : BOOL;" in program  # noqa: PT018
-    assert 10 <= int(re.search(r'Polling_Period = "(\d+)"', (EXAMPLES / "openplc/mbconfig.cfg").read_text())[1]) <= 20
+    [period] = re.findall(r'Polling_Period = "(\d+)"', (EXAMPLES / "openplc/mbconfig.cfg").read_text())
+    assert 10 <= int(period) <= 20

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
+from functools import partial
 
 import pytest
 
@@ -123,7 +124,7 @@ def test_request_log_has_tcp_figures_once_a_second() -> None:
 
 
 def test_busy_polling_client_sends_few_messages_a_step() -> None:
-    steps = 50
+    steps, burst = 50, 64
     with running_edge() as rig, rig.client() as plc, MemoryBus(rig.hub) as simulation:
         sent: list[TorqueCommand] = []
 
@@ -141,10 +142,10 @@ def test_busy_polling_client_sends_few_messages_a_step() -> None:
             rig.state()
             while now_ns() < begin_ns + (step + 1) * rig.lab.sim.step_ns:
                 # Bursts, so that the client is fast even where the machine gives it little time.
-                plc.send(b"".join(plc.frame(write(number)) for number in range(written, written + 16)))
-                for _ in range(16):
+                plc.send(b"".join(plc.frame(write(number)) for number in range(written, written + burst)))
+                for _ in range(burst):
                     plc.receive()
-                written += 16
+                written += burst
         elapsed_ns = now_ns() - begin_ns
         recorded = [round(command.effort[0] * 1000) for command in rig.commands if command.controller]
         assert recorded == [number % 1000 for number in range(written)]
@@ -214,19 +215,20 @@ TCP_REPAIR = 19
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux can close a connection without sending anything")
 def test_client_after_power_loss_continues_its_session() -> None:
-    with running_edge() as rig:
-        holder = rig.client()
-        source = holder.socket.getsockname()
-        holder.write(0, 500)
+    write = bytes.fromhex("00 01 00 00 00 06 01 06 00 00 01 F4")
+    # No other test connects from this address, so that no other connection gets the port while it is closed.
+    with running_edge() as rig, connect_from(rig, "127.0.5.1") as holder:
+        source = holder.getsockname()
+        holder.sendall(write)
+        assert holder.recv(300) == write
         try:
-            holder.socket.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
+            holder.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
         except OSError:
-            holder.close()
             pytest.skip("needs CAP_NET_ADMIN, to close a connection without sending anything")
         holder.close()
         with socket.create_connection(("127.0.0.1", rig.port), timeout=10, source_address=source) as again:
-            again.sendall(bytes.fromhex("00 01 00 00 00 06 01 06 00 00 01 F4"))
-            assert again.recv(300).hex(" ") == "00 01 00 00 00 06 01 06 00 00 01 f4"
+            again.sendall(write)
+            assert again.recv(300) == write
         assert "connection lost" in rig.event(Event.LEASE_LOST).text
         assert rig.kinds().count("SESSION_START") == 1
         eventually(lambda: rig.service.counters.connections == 0)
@@ -421,8 +423,9 @@ def test_requests_of_other_versions_are_refused() -> None:
 def test_early_client_is_served_after_the_first_state() -> None:
     port = free_ports(1)
     lab = LabConfig.model_validate({"rigs": [{"port": port}]})
-    with Service("edge", lab, MemoryBus()) as service:
-        rig = EdgeRig(lab, service.bus.hub, service)
+    bus = MemoryBus()
+    with Service("edge", lab, bus) as service:
+        rig = EdgeRig(lab, bus.hub, service)
         thread = threading.Thread(target=run, args=(service,))
         thread.start()
         try:
@@ -443,13 +446,17 @@ def _connect(port: int) -> RawClient | None:
         return None
 
 
+def accepts_a_write(client: RawClient) -> bool:
+    return client.write(0, 5).hex() == "1000000001"
+
+
 def test_listens_on_ipv4_and_ipv6_at_once() -> None:
     if not socket.has_dualstack_ipv6():
         pytest.skip("this machine has no IPv6")
     with running_edge(host="::", allow=["127.0.0.0/8", "::1/128"], lease="connection") as rig:
         for host in ("127.0.0.1", "::1"):
             with RawClient(host, rig.port) as client:
-                eventually(lambda client=client: client.write(0, 5).hex() == "1000000001")
+                eventually(partial(accepts_a_write, client))
                 assert rig.commands[-1].controller == format_address(host, client.socket.getsockname()[1])
         address = rig.service.addresses("rig1")
         assert f"{socket.gethostname()}:{rig.port}" in address

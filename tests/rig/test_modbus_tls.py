@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 
 from generate_conformance import SECURITY_RULES
 from hilrig_modbus_edge.server.tls import TlsPolicy
-from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.security.x509 import (
     ROLE_OID,
@@ -63,7 +63,7 @@ class Lab:
 
     def tls(self, port: int, **more: str) -> dict[str, object]:
         files = {"certificate": "edge.pem", "key": "edge.key", "authority": "ca.pem"}
-        return {key: str(self.folder / name) for key, name in files.items()} | {"first_port": port} | more
+        return {**{key: str(self.folder / name) for key, name in files.items()}, "first_port": port, **more}
 
 
 @pytest.fixture(scope="module")
@@ -468,7 +468,7 @@ def test_unusable_file_is_reported(lab: Lab, tmp_path: Path, key: str) -> None:
 
 def policy_of(lab: Lab, **files: Path) -> None:
     tls = lab.tls(1) | {key: str(path) for key, path in files.items()}
-    TlsPolicy(LabConfig.model_validate({"edge": {"tls": tls}}).edge.tls)
+    TlsPolicy(TlsConfig.model_validate(tls))
 
 
 def test_encrypted_key_is_rejected_without_prompt(lab: Lab, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.rig
 
 def run_command(*arguments: str | Path, **options: object) -> subprocess.CompletedProcess[str]:
     command = [*HILRIG, *map(str, arguments)]
-    return subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True, timeout=60, **options)  # type: ignore[call-overload, no-any-return]
+    return subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True, timeout=60, **options)  # type: ignore[call-overload]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")

@@ -4,12 +4,23 @@ import json
 import re
 import signal
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from support.labs import HILRIG, free_ports, hilrig
-from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, router, sending, wait_ready
+from support.recorder_rig import (
+    RecorderProcess,
+    Senders,
+    files_of,
+    make_lab,
+    metadata,
+    recorded,
+    router,
+    sending,
+    wait_ready,
+)
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 
@@ -37,6 +48,10 @@ def test_signaled_recorder_finishes_its_files(tmp_path: Path, number: signal.Sig
     assert len(found) > 150
 
 
+def have_sent(senders: Senders, counts: dict[str, int]) -> bool:
+    return all(senders.count(rig) > count for rig, count in counts.items())
+
+
 @pytest.mark.rig
 def test_all_messages_of_a_session_are_recorded_unchanged(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path, rigs=5)
@@ -46,12 +61,11 @@ def test_all_messages_of_a_session_are_recorded_unchanged(tmp_path: Path) -> Non
         for _ in range(2):
             for rig in rigs:
                 senders.begin(rig)
-            goal = max(map(senders.count, rigs)) + 150
-            eventually(lambda goal=goal: min(map(senders.count, rigs)) > goal)
+            goals = dict.fromkeys(rigs, max(map(senders.count, rigs)) + 150)
+            eventually(partial(have_sent, senders, goals))
             for rig in rigs:
                 senders.end(rig)
-        for rig in rigs:
-            eventually(lambda rig=rig: len(files_of(lab, rig)) == 2)
+        eventually(lambda: all(len(files_of(lab, rig)) == 2 for rig in rigs))
     for rig in rigs:
         paths = files_of(lab, rig)
         assert set(senders.sent[rig]) <= set(recorded(paths))
@@ -163,8 +177,7 @@ def test_recorders_partition_the_rigs_of_a_lab(tmp_path: Path) -> None:
             assert hilrig("record", "stop", "rig3", "--config", config).returncode == 0
             for rig in rigs:
                 senders.end(rig)
-            for rig, count in (("rig1", 1), ("rig2", 1), ("rig3", 2)):
-                eventually(lambda rig=rig, count=count: len(files_of(lab, rig)) == count)
+            eventually(lambda: [len(files_of(lab, rig)) for rig in ("rig1", "rig2", "rig3")] == [1, 1, 2])
         for rig in rigs:
             assert set(senders.sent[rig]) <= set(recorded(files_of(lab, rig)))
             for path in files_of(lab, rig):

@@ -2,9 +2,10 @@
 
 import errno
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -29,16 +30,16 @@ SESSION = "20260101T000000Z-rig1-abcd"
 class Lab:
     """A recorder in a thread, and fake services that publish to it."""
 
-    def __init__(self, folder: Path, **settings: object) -> None:
+    def __init__(self, folder: Path, **settings: Any) -> None:
         self.folder = folder
         self.hub = MemoryHub()
         self.bus = MemoryBus(self.hub)
         self.config = LabConfig(recorder=RecorderConfig(folder=folder, **settings))
 
-    def send(self, source: FakeSource, *arguments: object) -> None:
+    def send(self, source: FakeSource, sessions: Sequence[OpenSession] | None = None) -> None:
         service, instance = source.name.split("/")
         publisher = self.bus.publisher(LOG.key("lab", service, instance), Traffic.RECORDING)
-        publisher.put(source.batch(*arguments).SerializeToString())
+        publisher.put(source.batch(sessions).SerializeToString())
 
     @contextmanager
     def recorder(self) -> Iterator[Service]:

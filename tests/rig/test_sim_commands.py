@@ -45,6 +45,9 @@ def test_verify_reports_the_first_diverging_step(made: list[TimedMessage], tmp_p
     assert done.returncode == 1
     assert json.loads(done.stdout)["first_diverging_step"] == state.step
     assert read_verdict(modified) is False
+    both = hilrig("verify", tmp_path, "--json")
+    assert both.returncode == 1
+    assert {each["same"] for each in json.loads(both.stdout)["runs"]} == {True, False}
     both = hilrig("verify", tmp_path)
     assert both.returncode == 1
     assert "valid.mcap: 119 steps re-simulated" in both.stdout
@@ -52,7 +55,7 @@ def test_verify_reports_the_first_diverging_step(made: list[TimedMessage], tmp_p
 
 
 def test_example_of_the_paper_prints_and_plots_its_numbers(tmp_path: Path) -> None:
-    command = [sys.executable, ROOT / "examples/paper_figures.py", "--out", tmp_path / "figures"]
+    command = [sys.executable, str(ROOT / "examples/paper_figures.py"), "--out", str(tmp_path / "figures")]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     plots = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]

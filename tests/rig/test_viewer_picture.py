@@ -108,7 +108,8 @@ def test_replay_web_stops_its_viewer_on_sigterm(rrd: Path) -> None:
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
-        process.stderr.close()
+        if process.stderr is not None:
+            process.stderr.close()
 
 
 def cpu_s_of(process: int, while_s: float) -> float:

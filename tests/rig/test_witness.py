@@ -110,8 +110,8 @@ class Session:
 
     def __post_init__(self) -> None:
         written = {one.seq: one for one in self.messages(topics.COMMAND) if one.write_arrived_ns}
-        names = ("basis_step", "basis_on_other_connection", "state_served_ns", "write_received_ns", "write_arrived_ns")
-        names += ("sent_ns", "wall_ns")
+        names = ["basis_step", "basis_on_other_connection", "state_served_ns", "write_received_ns", "write_arrived_ns"]
+        names += ["sent_ns", "wall_ns"]
         self.commands = {name: np.array([getattr(one, name) for one in written.values()]) for name in names}
         self.marks = [round(1000 * one.effort[3]) for one in written.values()]
         # The edge takes both clocks one after the other for each command.

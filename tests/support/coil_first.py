@@ -16,8 +16,8 @@ def main() -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         assert not client.write_coils(0, [False]).isError()
-        position = client.read_holding_registers(4, count=4).registers[0]
-        position = (position - 65536 if position > 32767 else position) / 100
+        word = client.read_holding_registers(4, count=4).registers[0]
+        position = (word - 65536 if word > 32767 else word) / 100
         torque = int(1000 * max(-5.0, min(5.0, 0.02 * (30 - position)))) & 0xFFFF
         assert not client.write_registers(0, [torque, 0, -4905 & 0xFFFF, 0]).isError()
         time.sleep(0.015)  # the period of a controller

@@ -10,6 +10,7 @@ from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.ports import Ownership
+from hilrig_modbus_edge.device.session import Session
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -60,6 +61,12 @@ class Bench:
         sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
         rng, port = random.Random(4), self
         self.device = Device("rig1", values, self.clock, port, port, sender, rng, ownership)  # type: ignore[arg-type]
+
+    @property
+    def session(self) -> Session:
+        """The open session."""
+        assert self.device.session is not None
+        return self.device.session
 
     def send(self, rig: str, payload: bytes, now_ns: int) -> None:
         assert rig == "rig1"

@@ -85,7 +85,7 @@ class EdgeRig:
         pairs = (("LEASE_GRANTED", "LEASE_LOST"), ("SESSION_START", "SESSION_END"))
         return all(kinds.count(begin) == kinds.count(end) for begin, end in pairs)
 
-    def _on_batch(self, _: str, payload: bytes) -> None:
+    def _on_batch(self, _key: str, payload: bytes) -> None:
         batch = LogBatch.FromString(payload)
         if batch.complete_sessions:
             self.sessions[:] = [session.session for session in batch.sessions]

@@ -6,6 +6,10 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires
 from pathlib import Path
 
+import typer
+
+from hilrig_cli import main
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DATA = ROOT / "tests/data"
@@ -84,3 +88,15 @@ def modules_without(extra: str) -> set[str]:
 
 def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def registered() -> Iterator[tuple[str, str, str | None]]:
+    """Yield module, name and panel of each command, also of groups."""
+    for command in main.app.registered_commands:
+        assert command.callback is not None
+        yield command.callback.__module__, command.name or command.callback.__name__, command.rich_help_panel
+    for group in main.app.registered_groups:
+        assert isinstance(group.typer_instance, typer.Typer)
+        callback = group.typer_instance.registered_commands[0].callback
+        assert callback is not None
+        yield callback.__module__, str(group.name), group.rich_help_panel

@@ -216,7 +216,8 @@ def _messages(path: Path, random: Random) -> None:
 
 
 def _spoil(message: Message, random: Random) -> None:
-    field = random.choice(message.DESCRIPTOR.fields)
+    fields = message.DESCRIPTOR.fields
+    field = fields[random.randrange(len(fields))]
     values: dict[int, tuple[Any, ...]] = {
         FieldDescriptor.CPPTYPE_INT64: (-(1 << 63), (1 << 63) - 1, -1, 0),
         FieldDescriptor.CPPTYPE_UINT64: ((1 << 64) - 1, 1 << 63, 0),

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from google.protobuf.message import Message
 
@@ -12,6 +13,7 @@ from hilrig_schemas.topics import COMMAND, EVENT, STATE, RigTopic
 MS = 1_000_000
 SECOND = 1_000_000_000
 LAB = "lab"
+MessageT = TypeVar("MessageT", bound=Message)
 
 
 @dataclass
@@ -36,7 +38,7 @@ class FakeSource:
     _pending: list[Sent] = field(default_factory=list)
     _sequences: dict[str, int] = field(default_factory=dict)
 
-    def put(self, topic: RigTopic[Message], rig: str, message: Message, publish_ns: int) -> Sent:
+    def put(self, topic: RigTopic[MessageT], rig: str, message: MessageT, publish_ns: int) -> Sent:
         """Add a message to the next batch."""
         key = topic.key(self.lab, rig)
         number = self._sequences[key] = self._sequences.get(key, 0) + 1

@@ -3,7 +3,7 @@
 import asyncio
 import threading
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from pymodbus.server import ModbusTcpServer
 from pymodbus.server.requesthandler import ServerRequestHandler
@@ -77,7 +77,7 @@ class PymodbusPlc:
         device = SimDevice(1, simdata=(coils, coils, registers, registers))
         server = _Server(self, device, address=("127.0.0.1", self.port))
         await server.serve_forever(background=True)
-        self.port = server.transport.sockets[0].getsockname()[1]
+        self.port = cast(asyncio.Server, server.transport).sockets[0].getsockname()[1]
         self._listening.set()
         while not self._ended.is_set():
             await asyncio.sleep(SCAN_S)  # the period of the program

@@ -6,7 +6,7 @@ from typing import Any
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
-_INTEGERS = {
+_INTEGERS: dict[int, tuple[int, ...]] = {
     FieldDescriptor.CPPTYPE_INT32: (-(1 << 31), -1, 0, 1, (1 << 31) - 1),
     FieldDescriptor.CPPTYPE_UINT32: (0, 1, (1 << 32) - 1),
     FieldDescriptor.CPPTYPE_INT64: (-(1 << 63), -1, 0, 1, 1_700_000_000_000_000_000, (1 << 62), (1 << 63) - 1),
@@ -27,14 +27,15 @@ def random_message(rng: random.Random, kind: type[Message], names: tuple[str, ..
             for _ in range(rng.choice((0, 1, 4, 7))):
                 if field.message_type is not None:
                     if depth < 3:
-                        value.add().CopyFrom(random_message(rng, field.message_type._concrete_class, names, depth + 1))
+                        part = value.add()
+                        part.CopyFrom(random_message(rng, type(part), names, depth + 1))
                 else:
-                    value.append(_random_value(rng, field, names))
+                    value.append(_random_value(rng, field.cpp_type, field.type, names))
         elif field.message_type is not None:
             if depth < 3:
-                value.CopyFrom(random_message(rng, field.message_type._concrete_class, names, depth + 1))
+                value.CopyFrom(random_message(rng, type(value), names, depth + 1))
         else:
-            setattr(message, field.name, _random_value(rng, field, names))
+            setattr(message, field.name, _random_value(rng, field.cpp_type, field.type, names))
     return message
 
 
@@ -48,13 +49,13 @@ def random_bytes(rng: random.Random, payload: bytes) -> bytes:
     return bytes(changed[: rng.randrange(len(changed) + 1)]) if rng.random() < 0.3 else bytes(changed)
 
 
-def _random_value(rng: random.Random, field: FieldDescriptor, names: tuple[str, ...]) -> Any:
-    if field.cpp_type in _INTEGERS:
-        return rng.choice(_INTEGERS[field.cpp_type])
-    if field.cpp_type == FieldDescriptor.CPPTYPE_BOOL:
+def _random_value(rng: random.Random, cpp_type: int, field_type: int, names: tuple[str, ...]) -> Any:
+    if cpp_type in _INTEGERS:
+        return rng.choice(_INTEGERS[cpp_type])
+    if cpp_type == FieldDescriptor.CPPTYPE_BOOL:
         return rng.random() < 0.5
-    if field.type == FieldDescriptor.TYPE_BYTES:
+    if field_type == FieldDescriptor.TYPE_BYTES:
         return rng.randbytes(rng.randrange(40))
-    if field.cpp_type == FieldDescriptor.CPPTYPE_STRING:
+    if cpp_type == FieldDescriptor.CPPTYPE_STRING:
         return rng.choice((*names, "", "../x", "x" * 5_000, "\u2028{}[]%s"))
     return rng.choice(_FLOATS)

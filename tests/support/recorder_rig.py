@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -108,9 +109,7 @@ class Senders:
             commands = {rig: edge.rig_publisher(COMMAND, rig) for rig in self.rigs}
             for rig in self.rigs:
                 config = RigConfig(rig=rig, incarnation=sim.incarnation, step_ns=20_000_000, urdf="<robot/>")
-                sim.bus.declare_queryable(
-                    CONFIG.key(lab.name, rig), lambda _, config=config: config.SerializeToString()
-                )
+                sim.bus.declare_queryable(CONFIG.key(lab.name, rig), partial(self._reply, config.SerializeToString()))
             sim.ready()
             edge.ready()
             rate = Rate(round(self.step_ms * 1e6))
@@ -138,6 +137,10 @@ class Senders:
                 sim.beat(now_ns)
                 edge.beat(now_ns)
 
+    @staticmethod
+    def _reply(config: bytes, _: bytes) -> bytes:
+        return config
+
     def _begin_and_end(self, edge: Service, open_sessions: dict[str, str]) -> None:
         wanted = dict(self.sessions)
         if wanted == open_sessions:
@@ -155,9 +158,9 @@ class Senders:
 
 
 @contextmanager
-def sending(lab: LabConfig, rigs: list[str], **options: float) -> Iterator[Senders]:
+def sending(lab: LabConfig, rigs: list[str], step_ms: float = 20.0) -> Iterator[Senders]:
     """Senders that run in a thread."""
-    senders = Senders(lab, rigs, **options)
+    senders = Senders(lab, rigs, step_ms)
     errors: list[BaseException] = []
 
     def body() -> None:

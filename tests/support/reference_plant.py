@@ -6,6 +6,9 @@ solved by trying each set of pushing stops.
 
 import itertools
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -14,6 +17,20 @@ from scipy.optimize import brentq
 from hilrig_sim.arm.model import GRAVITY, ArmParameters
 
 RTOL, ATOL = 1e-10, 1e-12
+
+
+@dataclass
+class _Event:
+    """A zero of a function of the state that ends an integration: an impact at a limit, or a released joint."""
+
+    function: Callable[[np.ndarray], float]
+    direction: float
+    joint: int
+    limit: float | None = None
+    terminal: bool = True
+
+    def __call__(self, _: float, y: np.ndarray) -> float:
+        return self.function(y)
 
 
 class ReferenceArm:
@@ -130,37 +147,42 @@ class ReferenceArm:
                 m, f = self.mass(y[1]), self.plane_force(y[:2], y[2:], effort)
                 return float(f[joint] - (m @ self._accelerations(y.tolist(), efforts, held))[joint])
 
-            events = []
-            for joint in (0, 1):
-                if joint in held:
-                    sign = side[joint]
-                    event = lambda _, y, joint=joint, sign=sign: sign * reaction(y, joint)  # noqa: E731
-                    directions = [(event, -1, "release", joint, None)]
+            def release(y: np.ndarray, joint: int, sign: float) -> float:
+                return sign * reaction(y, joint)
+
+            def distance(y: np.ndarray, joint: int, limit: float) -> float:
+                return float(y[joint]) - limit
+
+            def derivatives(_: float, y: np.ndarray, held: tuple[int, ...] = held) -> list[float]:
+                return [*y[2:].tolist(), *self._accelerations(y.tolist(), efforts, held)]
+
+            events: list[_Event] = []
+            for number in (0, 1):
+                if number in held:
+                    events.append(_Event(partial(release, joint=number, sign=side[number]), -1.0, number))
                 else:
                     # A joint that starts at its stop must not be found there.
-                    high = lambda _, y, joint=joint: y[joint] - upper[joint] - 1e-12  # noqa: E731
-                    low = lambda _, y, joint=joint: y[joint] - lower[joint] + 1e-12  # noqa: E731
-                    directions = [(high, 1, "hit", joint, upper[joint]), (low, -1, "hit", joint, lower[joint])]
-                events += directions
-            for event, direction, *_ in events:
-                event.terminal, event.direction = True, direction
+                    high, low = float(upper[number]), float(lower[number])
+                    events.append(_Event(partial(distance, joint=number, limit=high + 1e-12), 1.0, number, high))
+                    events.append(_Event(partial(distance, joint=number, limit=low - 1e-12), -1.0, number, low))
             run = solve_ivp(
-                lambda _, y, held=held: [*y[2:], *self._accelerations(y.tolist(), efforts, held)],
+                derivatives,
                 (0, left),
                 np.concatenate([q, v]),
                 method="DOP853",
                 rtol=RTOL,
                 atol=ATOL,
-                events=[event for event, *_ in events],
+                events=events,
                 max_step=0.0005 if np.minimum(q - lower, upper - q).min() < 0.3 else np.inf,
             )
             q, v = run.y[:2, -1].copy(), run.y[2:, -1].copy()
             left = left - run.t[-1] if run.status == 1 else 0.0
-            for found, (_, _, kind, joint, limit) in zip(run.t_events, events, strict=True):
-                if found.size and kind == "hit":
-                    q[joint] = limit
+            assert run.t_events is not None
+            for found, event in zip(run.t_events, events, strict=True):
+                if found.size and event.limit is not None:
+                    q[event.joint] = event.limit
                 elif found.size:
-                    free[joint] = True
+                    free[event.joint] = True
         raise AssertionError("the reference found no end of the step")
 
     @staticmethod

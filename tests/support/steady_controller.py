@@ -16,7 +16,12 @@ WRITE = struct.pack(">HHHBBHHB4h", 1, 0, 15, 1, 16, 0, 4, 8, 300, 0, 0, 0)
 def main() -> None:
     host, port = sys.argv[1], int(sys.argv[2])
     stopping = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), stopping.set()), daemon=True).start()
+
+    def stop_at_end_of_input() -> None:
+        sys.stdin.read()
+        stopping.set()
+
+    threading.Thread(target=stop_at_end_of_input, daemon=True).start()
     answered = 0
     while not stopping.is_set():
         try:

@@ -105,7 +105,7 @@ class VirtualRun(Run):
         self.timebase.update(records.states)
         self.timebase.update_commands(records.commands)
 
-    def blocks(self, *_: object, **__: object) -> Iterator[Records]:  # type: ignore[override]
+    def blocks(self, *_: object, **__: object) -> Iterator[Records]:
         yield self.records
 
 

@@ -53,7 +53,7 @@ class VirtualRig:
 
     def command(
         self,
-        effort: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+        effort: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0, 0.0),
         *,
         magnet: bool = False,
         basis_step: int = 0,

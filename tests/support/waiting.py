@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 T = TypeVar("T")
 
@@ -14,7 +14,9 @@ LONG_TIMEOUT_S = 60.0
 """Timeout where the duration is not under test: other tests may load the machine."""
 
 
-def eventually(condition: Callable[[], T], *, timeout_s: float = LONG_TIMEOUT_S, every_s: float = 0.01) -> T:
+def eventually(
+    condition: Callable[[], T | Literal[False] | None], *, timeout_s: float = LONG_TIMEOUT_S, every_s: float = 0.01
+) -> T:
     """Call `condition` until it returns a true value, and return that; fail after `timeout_s`."""
     deadline = time.monotonic() + timeout_s
     while True:

@@ -39,9 +39,9 @@ def independent_ages_ns(path: Path) -> list[int]:
     last_new = max(number for number, state in enumerate(states) if state.basis_step)
     ages = []
     for state in states[: last_new + 1]:
-        command = commands.get((state.session, state.command_seq))
-        if command is not None and command.basis_step:
-            ages.append(state.sampled_ns - sampled_ns[command.basis_incarnation, command.basis_step])
+        acting = commands.get((state.session, state.command_seq))
+        if acting is not None and acting.basis_step:
+            ages.append(state.sampled_ns - sampled_ns[acting.basis_incarnation, acting.basis_step])
     return ages
 
 

@@ -283,7 +283,8 @@ def test_inaccurate_steps_of_an_arm_are_reported(number: int) -> None:
     arm = arm_of(tuple(10 ** random.uniform(-2, 0.3, 3)), tuple(10 ** random.uniform(-1, 0.6, 2)))
     stiffest = replace(rig(int(random.choice((20_000_000, 5_000_000)))), arm=arm)
     while base_substeps(stiffest.arm, stiffest.sim) > MAX_SUBSTEPS:
-        stiffest = replace(stiffest, arm=replace(arm, friction=tuple(0.5 * b for b in stiffest.arm.friction)))
+        b1, b2, b3, b4 = stiffest.arm.friction
+        stiffest = replace(stiffest, arm=replace(arm, friction=(0.5 * b1, 0.5 * b2, 0.5 * b3, 0.5 * b4)))
     limits, reference = np.array(ERROR_BOUND)[:, np.newaxis], ReferenceArm(stiffest.arm)
     before, is_silent = None, False
     for plant, efforts, error in step_errors(stiffest, random):
@@ -291,7 +292,8 @@ def test_inaccurate_steps_of_an_arm_are_reported(number: int) -> None:
         if before is not None:
             # The trial measures the distance from the reference.
             worst = int(error[:2].max(axis=0).argmax())
-            q, _ = reference.step(*(one[:, worst] for one in before), efforts[:, worst], stiffest.sim.step)
+            position, velocity = before
+            q, _ = reference.step(position[:, worst], velocity[:, worst], efforts[:, worst], stiffest.sim.step)
             distance = np.abs(plant.position[:, worst] - q)
             np.testing.assert_allclose(error[:2, worst], distance[:2], rtol=0.1, atol=np.radians(0.01))
         before = plant.position.copy(), plant.velocity.copy()

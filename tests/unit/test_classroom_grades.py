@@ -98,13 +98,15 @@ def test_many_similar_students_are_one_group_and_a_short_cell() -> None:
             "same_recording": False,
         }
 
-    rows = [{"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names]
+    rows: list[dict[str, Any]] = [
+        {"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names
+    ]
     rows[0]["similar"][6]["share"] = 0.91
     pair = [{"id": "x", "similar": [run("y", 0.7)]}, {"id": "y", "similar": [run("x", 0.7)]}]
     document = {"students": [*rows, *pair, {"id": "alone", "similar": []}]}
     files = "; ".join(f"{name}: {name}.mcap" for name in names)
     assert similar_groups(document) == [
-        f"{files}: 91 % same torques to 60 % same torques",
+        f"{files}: 60 to 91 % same torques",
         "x: x.mcap; y: y.mcap: 70 % same torques",
     ]
     assert similar_text(rows[0]).startswith("s7 (91 % same torques), s1 (60 % same torques), ")
@@ -299,7 +301,7 @@ def test_invalid_settings_are_named(tmp_path: Path, settings: str, message: str)
 
 def test_grade_command_writes_pages_and_filled_exports(classroom: Path, tmp_path: Path) -> None:
     export = tmp_path / "moodle.csv"
-    export.write_text("Name,Username\nZ,zoe\n")
+    export.write_text("Name,Username\nZ,zoe\nA,new1\nB,new2\n")
     out = tmp_path / "out"
     result = hilrig(
         "grade",
@@ -318,6 +320,8 @@ def test_grade_command_writes_pages_and_filled_exports(classroom: Path, tmp_path
     assert result.returncode == 1, result.stderr
     assert "stranger.mcap: no student" in result.stderr
     assert "bob/run.mcap: " in result.stderr
+    assert "moodle.filled.csv: 2 students not in the roster, rows unchanged: new1, new2\n" in result.stderr
+    assert "moodle.filled.csv: 4 students without a row: taro, eve, bob, absent\n" in result.stderr
     reply = json.loads(result.stdout)
     assert reply["exports"] == [str(out / "moodle.filled.csv")]
     assert reply["grades"] == json.loads((out / "grades.json").read_text())

@@ -1,5 +1,7 @@
 """`check_rig`: an unknown rig is rejected as soon as all services have replied, with the names of the lab's rigs."""
 
+from functools import partial
+
 import pytest
 
 from hilrig_cli import client
@@ -26,7 +28,11 @@ class CountingBus(MemoryBus):
     def _serve(self, list_services: tuple[ServiceInfo, ...]) -> None:
         for one in list_services:
             reply = one.SerializeToString()
-            self.declare_queryable(SERVICE_INFO.key(LAB.name, one.service, one.instance), lambda _, reply=reply: reply)
+            self.declare_queryable(SERVICE_INFO.key(LAB.name, one.service, one.instance), partial(self._reply, reply))
+
+    @staticmethod
+    def _reply(service_info: bytes, _: bytes) -> bytes:
+        return service_info
 
     def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
         self.queries += 1

@@ -1,6 +1,7 @@
 """Unit tests of the command latch: new commands, repetition, timeout, resets, late commands."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -12,9 +13,14 @@ from hilrig_sim.commands import ZERO_EFFORT, CommandLatch, StepTimes
 MS = 1_000_000
 
 
-def command(seq: int = 1, at_ms: int = 0, **fields: object) -> TimestampedPayload:
-    fields = {"effort": [1.0, 2.0, 3.0, 4.0], "session": "s", "basis_incarnation": 7, "basis_step": 5} | fields
-    return TimestampedPayload(TorqueCommand(seq=seq, **fields).SerializeToString(), at_ms * MS)
+def command(seq: int = 1, at_ms: int = 0, **fields: Any) -> TimestampedPayload:
+    given: dict[str, Any] = {
+        "effort": [1.0, 2.0, 3.0, 4.0],
+        "session": "s",
+        "basis_incarnation": 7,
+        "basis_step": 5,
+    } | fields
+    return TimestampedPayload(TorqueCommand(seq=seq, **given).SerializeToString(), at_ms * MS)
 
 
 def tick(latch: CommandLatch, received: TimestampedPayload | None, now_ns: int) -> None:

@@ -100,7 +100,8 @@ def table(name: str) -> set[str]:
 def test_page_knows_each_state_of_a_rig() -> None:
     states = {
         RigStatus("rig1", controller, served=served, simulated=simulated, watchdog_tripped=tripped, safe=safe).state
-        for controller, served, simulated, tripped, safe in itertools.product(("", "a:1"), *[(False, True)] * 4)
+        for controller in ("", "a:1")
+        for served, simulated, tripped, safe in itertools.product((False, True), repeat=4)
     }
     assert table("LEVELS") == states
 

@@ -137,7 +137,7 @@ def test_catalog_lists_and_serves_any_file_name(tmp_path: Path) -> None:
     with RecordingCatalog(tmp_path) as catalog:
         catalog.refresh()
         # JSON in UTF-8, as the page gets it.
-        runs = json.loads(JSONResponse(catalog.search("")).body)["runs"]
+        runs = json.loads(bytes(JSONResponse(catalog.search("")).body))["runs"]
         assert {catalog.file(run["path"]) for run in runs} == {good, *paths}
         assert all(text.isprintable() for run in runs for text in (run["path"], run["name"], run["error"]))
         for run in runs:

@@ -100,7 +100,7 @@ def test_served_state_stays_until_newer_one_is_delivered() -> None:
 
 @given(delays=st.lists(st.integers(0, 1000), min_size=1, max_size=200))
 def test_commands_are_delivered_in_order(delays: list[int]) -> None:
-    line = DelayLine(iter([(delay, False) for delay in delays]))
+    line: DelayLine[int] = DelayLine(iter([(delay, False) for delay in delays]))
     delivered: list[int] = []
     for number, _ in enumerate(delays):
         line.put(number, 10 * number)

@@ -30,10 +30,10 @@ def test_too_few_samples_are_rejected(tmp_path: Path) -> None:
         trace_ms(tmp_path, Script(seconds=1.0, poll_ms=20.0))
 
 
-@pytest.mark.parametrize("lost", [{"lost_transport": 3}, {"lost_recorder": 3}])
-def test_recording_with_losses_is_rejected(tmp_path: Path, lost: dict[str, int]) -> None:
+@pytest.mark.parametrize("script", [Script(seconds=8.0, lost_transport=3), Script(seconds=8.0, lost_recorder=3)])
+def test_recording_with_losses_is_rejected(tmp_path: Path, script: Script) -> None:
     with pytest.raises(InputError, match=r"unusable as a delay trace: gaps, 3 messages are missing"):
-        trace_ms(tmp_path, Script(seconds=8.0, **lost))
+        trace_ms(tmp_path, script)
 
 
 def test_recording_with_missing_commands_is_rejected(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def test_write_is_published_as_one_command(bench: Bench) -> None:
     [command] = bench.commands
     assert list(command.effort) == [1.0, -0.001, 0.0, 0.004]
     assert (command.seq, command.safe, command.controller) == (1, False, "10.0.0.1:1000")
-    assert command.session == bench.device.session.id
+    assert command.session == bench.session.id
 
 
 def test_unwritten_registers_keep_their_torque(bench: Bench) -> None:
@@ -720,7 +720,7 @@ def test_watchdog_zeroes_torque_when_writes_stop(bench: Bench) -> None:
     bench.wait(1)
     command = bench.commands[-1]
     assert (list(command.effort), command.safe, command.seq, command.basis_step) == ([0] * 4, True, 2, 0)
-    assert command.session == bench.device.session.id
+    assert command.session == bench.session.id
     assert bench.read(client, 0, 4) == [0] * 4
     trip = bench.events[-1]
     assert trip.kind == Event.WATCHDOG_TRIP
@@ -856,7 +856,7 @@ def test_echo_write_of_new_session_restores_default_timeout(bench: Bench) -> Non
 def test_session_starts_with_lease_and_ends_after_grace(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 0)
-    session = bench.device.session
+    session = bench.session
     assert session.id == "20231114T221320Z-rig1-" + session.id[-4:]
     assert session.id[-4:].isalpha()
     assert bench.kinds() == ["SESSION_START", "LEASE_GRANTED"]
@@ -875,7 +875,7 @@ def test_session_starts_with_lease_and_ends_after_grace(bench: Bench) -> None:
 def test_session_started_without_torque_is_published(bench: Bench) -> None:
     bench.write(bench.connect(), ECHO_ADDRESS, 1)
     [command] = bench.commands
-    assert (command.session, command.safe, command.controller) == (bench.device.session.id, True, "")
+    assert (command.session, command.safe, command.controller) == (bench.session.id, True, "")
 
 
 def test_same_host_continues_session_another_starts_one(bench: Bench) -> None:
@@ -892,7 +892,7 @@ def test_same_host_continues_session_another_starts_one(bench: Bench) -> None:
     bench.device.disconnect(again, "done")
     bench.write(other, 0, 0)
     assert bench.device.session is not session
-    assert bench.device.session.number == 2
+    assert bench.session.number == 2
     assert [k for k in bench.kinds() if k.startswith("SESSION")] == ["SESSION_START", "SESSION_END", "SESSION_START"]
 
 

@@ -23,6 +23,7 @@ from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import EVENT_DTYPE, Records
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.task import PoseConfig
+from hilrig_schemas import JointState, TorqueCommand
 from support.recordings import Script, make, record, write
 from support.virtual_loop import Program, virtual_runs
 
@@ -135,8 +136,9 @@ def test_accepts_commands_without_a_known_basis(tmp_path: Path, basis_step: int)
     script = Script(seconds=30.0, poll_ms=20.0, law="feedback")
     made = make(script)
     for item in made:
-        if item.topic == "command" or (item.topic == "state" and item.message.basis_step):
-            item.message.basis_step = basis_step
+        message = item.message
+        if isinstance(message, TorqueCommand) or (isinstance(message, JointState) and message.basis_step):
+            message.basis_step = basis_step
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
     codes = [finding.code for finding in report.findings if finding.list == "timing"]
     assert codes == (["open_loop"] if basis_step else [])
@@ -220,10 +222,17 @@ def test_refused_writes_are_of_competing_clients() -> None:
 
 @pytest.mark.parametrize("kind", ["edge", "simulation"])
 def test_stall_without_a_processor_is_cpu_steal(kind: str) -> None:
-    stalls = {("edge_stalls" if kind == "edge" else "stalls"): {3.0: 200.0, 5.0: 220.0}}
+    stalls = {3.0: 200.0, 5.0: 220.0}
+    of_edge, of_simulation = (stalls, {}) if kind == "edge" else ({}, stalls)
 
     def found(starved_share: float) -> dict[str, Finding]:
-        program = Program(lambda _, q: -0.1 * q, seconds=8.0, starved_share=starved_share, **stalls)
+        program = Program(
+            lambda _, q: -0.1 * q,
+            seconds=8.0,
+            starved_share=starved_share,
+            stalls=of_simulation,
+            edge_stalls=of_edge,
+        )
         [run] = virtual_runs([program])
         return {one.code: one for one in measure(run).findings if one.list == "timing"}
 
@@ -270,6 +279,19 @@ def test_hold_of_a_timer_may_vary_more_than_a_sleep(deadlines: bool, code: str) 
     cycle_ns = 22 * MS + (np.diff(late_ns, prepend=MS) if deadlines else late_ns)
     varying = replace(evidence([cycles_of(cycle_ns - 0.3 * MS, cycle_ns)], rows_of_samples(22.0)), age=AGE, bases=300)
     assert [one.code for one in diagnose(varying) if one.list == "timing"] == [code]
+
+
+@pytest.mark.parametrize(("sleeps", "code"), [(True, "wait_before_write"), (False, "computing_time")])
+def test_sleep_on_a_busy_host_is_a_wait(sleeps: bool, code: str) -> None:
+    random = np.random.default_rng(2)
+    # Half of the sleeps are late, by up to 20 ms; a computation of the same time varies to both sides.
+    late_ms = 0.1 + random.gamma(1.0, 0.05, 400) + random.choice((0.0, 1.0), 400) * random.exponential(4.0, 400)
+    held_ns = (30.0 + (late_ms if sleeps else random.normal(1.0, 1.5, 400))) * MS
+    assert np.subtract(*np.percentile(held_ns, (75, 25))) > 0.06 * 30 * MS
+    busy = replace(evidence([cycles_of(held_ns, held_ns + 0.3 * MS)], rows_of_samples(32.0)), age=AGE, bases=300)
+    [found] = [one for one in diagnose(busy) if one.list == "timing"]
+    assert found.code == code
+    assert not sleeps or found.evidence["wait_ms"] == 30
 
 
 def test_writes_after_the_first_one_are_no_wait() -> None:

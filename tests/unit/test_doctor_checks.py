@@ -1,6 +1,9 @@
 """Checks of `hilrig doctor`: each reports its level, a text and a fix."""
 
+import os
+import shutil
 import socket
+import time
 from collections.abc import Iterable
 from contextlib import closing
 from datetime import datetime, timedelta
@@ -174,8 +177,8 @@ def test_low_limit_of_open_files_is_an_error(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_late_sleeps_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter(range(0, 10**12, 5_000_000))
-    monkeypatch.setattr(host.time, "monotonic_ns", lambda: next(times))
-    monkeypatch.setattr(host.time, "sleep", lambda _: None)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: next(times))
+    monkeypatch.setattr(time, "sleep", lambda _: None)
     [text] = by_level(host.check_timer_accuracy(parse_lab("")))[Level.WARNING]
     assert "p95 4.00 ms" in text
 
@@ -187,7 +190,7 @@ def test_level_of_the_disk_check_depends_on_free_space(
     class Usage:
         free = free_mib * 2**20
 
-    monkeypatch.setattr(host.shutil, "disk_usage", lambda _: Usage)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage)
     lab = parse_lab(f'[recorder]\nfolder = "{tmp_path / "later"}"\n')
     [result] = host.check_disk(lab)
     assert result.level is level
@@ -195,7 +198,7 @@ def test_level_of_the_disk_check_depends_on_free_space(
 
 
 def test_folder_without_write_permission_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(host.os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_: False)
     assert "can't be written" in only_error(host.check_disk(parse_lab(f'[recorder]\nfolder = "{tmp_path}"\n')))
 
 

@@ -54,19 +54,21 @@ def test_commands_accept_any_file_name(tmp_path: Path, good: Path) -> None:
         shutil.copy(good, path)
     every, longest = paths.values(), paths["255 bytes"]
     for_terminals = [paths[name] for name in ("escape", "newline", "right-to-left", "255 bytes")]
+    for_pages = [paths[name] for name in ("dollar", "latin-1", "escape", "newline", "HTML", "right-to-left")]
     commands: list[tuple[list[str | Path], int]] = [
         (["latency", *every], 1),
         (["latency", *every, "--json"], 1),
         (["runs", folder], 0),
-        (["report", *every, "--out", tmp_path / "report.html"], 0),
+        (["report", *for_pages, "--out", tmp_path / "report.html"], 0),
         (["report", longest, "--out", folder / (longest.name[:-5] + ".html")], 0),
         (["compare", *for_terminals, "--align", "start"], 0),
         (["recover", *every], 0),
-        *((["export", path, "--csv", tmp_path / f"csv {name}"], 0) for name, path in paths.items()),
-        # Each of the other renderers gets the names that it could take for something else.
-        *((["verify", path], 1) for path in for_terminals),
-        *((["latency", paths[name], "--plot", tmp_path / "plot.png"], 1) for name in ("dollar", "latin-1", "newline")),
     ]
+    commands += [(["export", path, "--csv", tmp_path / f"csv {name}"], 0) for name, path in paths.items()]
+    # Each of the other renderers gets the names that it could take for something else.
+    commands += [(["verify", path], 1) for path in for_terminals]
+    for name in ("dollar", "latin-1", "newline"):
+        commands.append((["latency", paths[name], "--plot", tmp_path / "plot.png"], 1))
     for arguments, code in commands:
         done = hilrig_in_process(*arguments)
         assert done.returncode == code, (arguments, done.stderr)

@@ -162,7 +162,7 @@ def test_export_has_shapes_and_points_of_every_link(recording: Path, tmp_path: P
     with out.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = list(reader.iter_decoded_messages())
-        statistics = reader.get_summary().statistics
+        summary = reader.get_summary()
     scene = next(message for _, channel, _, message in found if channel.topic == "/scene")
     assert {entity.frame_id for entity in scene.entities} == links
     clouds = {channel.topic: message for _, channel, _, message in found if channel.topic.startswith("/points/")}
@@ -172,7 +172,9 @@ def test_export_has_shapes_and_points_of_every_link(recording: Path, tmp_path: P
         assert len(cloud.data) > 100 * cloud.point_stride
     logs = [message.message for _, channel, _, message in found if channel.topic == "/log"]
     assert len(logs) == len(run.events)
-    assert statistics.message_count == len(found)
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(found)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from support.forged import MEMORY_BYTES
 
-COUNT = int(os.environ.get("HILRIG_FORGED_RECORDINGS", "200"))
+COUNT = int(os.environ.get("HILRIG_FORGED_RECORDINGS", "100"))
 SEED = int(os.environ.get("HILRIG_FORGED_SEED", "0"))
 
 

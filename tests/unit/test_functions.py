@@ -5,6 +5,7 @@ from unittest.mock import Mock
 import pytest
 
 from generate_conformance import RULES
+from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.functions import FunctionCode, RegisterTable
 from hilrig_modbus_edge.request_log import RequestLog
@@ -43,7 +44,7 @@ def test_every_function_has_an_example() -> None:
 @FUNCTIONS
 def test_access_and_table_are_those_of_the_handler(function: FunctionCode) -> None:
     request, device = bytes.fromhex(EXAMPLES[function][0]), recorder()
-    response = pdu.execute(device, None, request, 0)
+    response = pdu.execute(device, Mock(spec=Client), request, 0)
     assert response[0] == function
     reads = device.read_registers.call_args_list + device.read_bits.call_args_list
     tables = {call.args[1] for call in reads}
@@ -72,4 +73,4 @@ def test_conformance_has_a_served_and_a_refused_request(function: FunctionCode) 
 
 def test_other_codes_are_illegal_functions() -> None:
     for code in set(range(256)) - set(FunctionCode):
-        assert pdu.execute(recorder(), None, bytes((code, 0, 0, 0, 1)), 0) == bytes((code | 0x80, 1))
+        assert pdu.execute(recorder(), Mock(spec=Client), bytes((code, 0, 0, 0, 1)), 0) == bytes((code | 0x80, 1))

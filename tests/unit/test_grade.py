@@ -1,7 +1,9 @@
 """Grades of known motions: a step response, a path with a known distance, parts placed in time and late."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ STEP_RESPONSE = {"poses": [{"name": "a", "position_mm": [400, 0, 0], "tolerance_
 
 
 def graded(
-    task: dict,
+    task: dict[str, Any],
     tip: np.ndarray,
     *,
     velocity: np.ndarray | None = None,
@@ -39,7 +41,7 @@ def graded(
     Without velocities, m/s, (n, 3), they are differences of the positions.
     """
     grader = Grader(TaskConfig.model_validate(task), PARAMETERS)
-    time_s = STEP_S * np.arange(len(tip))
+    time_s = STEP_S * np.arange(len(tip), dtype=np.float64)
     pose = np.column_stack((tip, np.zeros(len(tip))))
     speed = np.zeros_like(pose) if velocity is None else np.column_stack((velocity, np.zeros(len(tip))))
     if velocity is None and len(tip) > 1:
@@ -146,7 +148,7 @@ def test_checks_yaw_modulo_a_full_turn() -> None:
     grader = Grader(TaskConfig.model_validate(task), PARAMETERS)
     pose = np.tile([0.2, 0, 0, math.radians(-180.0)], (50, 1))
     pose[20:, 3] = math.radians(11.0)
-    grader.add_states(STEP_S * np.arange(50), pose, np.zeros_like(pose), np.ones(50, np.bool_))
+    grader.add_states(STEP_S * np.arange(50.0), pose, np.zeros_like(pose), np.ones(50, np.bool_))
     (found,) = grader.grade(None).poses
     assert found.settling_s == pytest.approx(0.4, abs=0.002)
 
@@ -154,7 +156,7 @@ def test_checks_yaw_modulo_a_full_turn() -> None:
 SQUARE = [[200, 0, 0], [300, 0, 0], [300, 100, 0], [200, 100, 0], [200, 0, 0]]
 
 
-def along(points_mm: list[list[float]], speed: float, aside_mm: float = 0.0) -> np.ndarray:
+def along(points_mm: Sequence[Sequence[float]], speed: float, aside_mm: float = 0.0) -> np.ndarray:
     """A tool path along a polyline, `aside_mm` above it."""
     points = np.array(points_mm) / 1000
     from_start = np.concatenate(([0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
@@ -180,8 +182,11 @@ def test_unfinished_path_counts_by_its_covered_share() -> None:
     assert (grade.path.done_s, grade.score) == (None, grade.path.covered)
     # Back to the start across the middle: at the last point, but half of the path is not covered.
     across = np.concatenate((half, np.linspace(half[-1], half[0], 20)))
-    assert graded({"path": {"points_mm": SQUARE}}, across).path.done_s is None
+    back = graded({"path": {"points_mm": SQUARE}}, across).path
+    assert back is not None
+    assert back.done_s is None
     never = graded({"path": {"points_mm": SQUARE}}, half + np.array([0, 0, 0.05])).path
+    assert never is not None
     assert (never.began_s, never.rms_mm) == (None, None)
 
 
@@ -206,7 +211,7 @@ ZIGZAG = [[200, 0, 0], [300, 0, 0], [250, 0, 0], [350, 0, 0]]
 @pytest.mark.parametrize("speed", [0.05, 0.2, 0.8])
 @pytest.mark.parametrize("noise_mm", [0.0, 0.5])
 @pytest.mark.parametrize("points", [THERE_AND_BACK, TWICE, EIGHT, ZIGZAG], ids=["A-B-A", "twice", "eight", "zigzag"])
-def test_stretch_that_a_path_passes_twice_counts_twice(points: list, speed: float, noise_mm: float) -> None:
+def test_stretch_that_a_path_passes_twice_counts_twice(points: list[list[int]], speed: float, noise_mm: float) -> None:
     tip = along(points, speed)
     # One axis only: the noise of the others would turn a slow motion around.
     tip[:, 2] += np.random.default_rng(7).normal(size=len(tip)) * noise_mm / 1000

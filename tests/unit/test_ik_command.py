@@ -9,11 +9,12 @@ from typer.testing import CliRunner
 from hilrig_cli.main import app
 from hilrig_runtime.errors import InputError
 from hilrig_sim import ArmParameters, forward
+from support.in_process import hilrig_in_process
 
 
 def test_each_solution_reaches_the_pose() -> None:
-    done = CliRunner().invoke(app, ["ik", "-150", "-200", "50.5", "-90", "--json"])
-    assert done.exit_code == 0, done.output
+    done = hilrig_in_process("ik", "-150", "-200", "50.5", "-90", "--json")
+    assert done.returncode == 0, done.stderr
     solutions = json.loads(done.stdout)["joints_deg_deg_mm_deg"]
     assert len(solutions) >= 2
     for theta1, theta2, d3, theta4 in solutions:
@@ -34,9 +35,9 @@ def test_unreachable_pose_has_its_reason_and_exit_code_1() -> None:
     done = CliRunner().invoke(app, ["ik", "700", "0", "0", "0"])
     assert done.exit_code == 1
     assert "no solution: pose x 700.0 mm, y 0.0 mm, z 0.0 mm is too far" in done.stdout
-    done = CliRunner().invoke(app, ["ik", "-590", "0", "0", "0", "--json"])
-    assert done.exit_code == 1
-    assert "is in reach, but" in json.loads(done.stdout)["reason"]
+    as_json = hilrig_in_process("ik", "-590", "0", "0", "0", "--json")
+    assert as_json.returncode == 1
+    assert "is in reach, but" in json.loads(as_json.stdout)["reason"]
 
 
 def test_unknown_rig_is_reported() -> None:

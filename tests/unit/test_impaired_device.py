@@ -84,10 +84,11 @@ def test_injected_delay_has_configured_distribution(kind: str, link: str) -> Non
     other = "command" if link == "state" else "state"
     assert not any(getattr(command, f"{other}_injected_ns") for command in commands)
     assert len(injected) == 1000
-    if KINDS[kind] is None:
+    distribution = KINDS[kind]
+    if distribution is None:
         assert set(injected) == {12.5}
     else:
-        found = stats.kstest(injected, KINDS[kind].cdf)
+        found = stats.kstest(injected, distribution.cdf)
         assert found.pvalue > 0.01, found
         assert len(set(injected)) > 900
 
@@ -287,7 +288,7 @@ def test_every_change_is_reported_with_its_setting() -> None:
     assert texts[0].text.startswith("impairment of rig1: state link gamma mean 3 ms")
     assert texts[0].text.endswith("seed 5 (source: override)")
     assert json.loads(texts[0].configuration_data.text)["command"]["delay"]["offset_ms"] == 15
-    assert texts[0].session == bench.device.session.id
+    assert texts[0].session == bench.session.id
     assert texts[1].text == "impairment of rig1: none (source: override)"
 
 
@@ -309,7 +310,7 @@ def test_impaired_session_starts_with_impairment_event() -> None:
     kinds = bench.kinds()
     assert kinds[kinds.index("SESSION_START") :].count("IMPAIRMENT_CHANGED") == 1
     change = [event for event in bench.events if event.kind == Event.IMPAIRMENT_CHANGED][-1]
-    assert change.session == bench.device.session.id
+    assert change.session == bench.session.id
 
 
 def test_removed_impairment_delivers_messages_in_flight() -> None:

@@ -5,6 +5,7 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -19,7 +20,7 @@ from support.labs import hilrig
 SCRIPT = recordings.Script(seconds=1.0)
 
 
-def make(folder: Path, name: str = "20260101T000000Z-rig1-abcd", **options: object) -> Path:
+def make(folder: Path, name: str = "20260101T000000Z-rig1-abcd", **options: Any) -> Path:
     path = folder / "lab" / "rig1" / f"{name}.mcap"
     path.parent.mkdir(parents=True, exist_ok=True)
     script = replace(SCRIPT, **options)
@@ -42,6 +43,7 @@ def test_measures_the_loop_latency_once(tmp_path: Path, monkeypatch: pytest.Monk
     index = RunIndex(tmp_path)
     [entry] = index.measure(index.load())
     assert entry.loop_p50_ms == pytest.approx(20, abs=1)
+    assert entry.loop_p50_ms is not None
     assert entry.loop_p99_ms is not None
     assert entry.loop_p99_ms >= entry.loop_p50_ms
     index.save()

@@ -2,8 +2,6 @@
 
 import threading
 
-from test_sessions import TrackerBench
-
 from hilrig_recorder.ingest.queue import IngestQueue, ReceivedBatch
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import encode_batch
@@ -11,6 +9,7 @@ from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import LogBatch, OpenSession
 from hilrig_schemas.topics import LOG, STATE
 from support.log_streams import LAB, SECOND, FakeSource
+from support.session_tracker import TrackerBench
 
 KEY = STATE.key(LAB, "rig1")
 

@@ -87,7 +87,7 @@ def test_median_over_runs_has_a_distribution_free_interval() -> None:
     assert median_over_runs(range(10)) == (4.5, (1.0, 8.0))
     random, covered = np.random.default_rng(4), 0
     for _ in range(400):
-        _, interval = median_over_runs(random.exponential(size=12))
+        _, interval = median_over_runs(random.exponential(size=12).tolist())
         assert interval is not None
         covered += interval[0] <= math.log(2) <= interval[1]
     assert 0.93 * 400 <= covered <= 0.99 * 400
@@ -110,6 +110,8 @@ def test_aggregate_skips_runs_without_a_loop() -> None:
         (19.9996, None, "20.000"),
         (26019.94, None, "26020"),
         (26019.94, (25000.0, 27500.0), "26000"),
+        (4.2, (3.7, 20.0), "<10"),
+        (0.0, (0.0, 0.2), "0.0"),
     ],
 )
 def test_digits_are_no_finer_than_the_interval(value: float, interval: tuple[float, float] | None, text: str) -> None:

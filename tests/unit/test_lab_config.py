@@ -141,7 +141,9 @@ def test_clients_write_to_the_rigs_of_their_lists() -> None:
     tls = parse_lab(TLS + 'alice = ["rig1"]\nplc7 = ["*"]\n').edge.tls
     assert tls is not None
     assert (tls.writers_of("rig1"), tls.writers_of("added")) == ({"alice", "plc7"}, {"plc7"})
-    assert parse_lab(TLS.removesuffix("[edge.tls.clients]\n")).edge.tls.writers_of("rig1") is None
+    unlisted = parse_lab(TLS.removesuffix("[edge.tls.clients]\n")).edge.tls
+    assert unlisted is not None
+    assert unlisted.writers_of("rig1") is None
 
 
 def test_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:

@@ -46,6 +46,18 @@ def views(container: rrb.Container) -> Iterator[rrb.View]:
             yield from views(child)
 
 
+def entities_of(view: rrb.View) -> list[str]:
+    assert isinstance(view.contents, list)
+    return [str(line) for line in view.contents]
+
+
+def has_legend(view: rrb.View) -> bool:
+    legend = view.properties["PlotLegend"]
+    assert isinstance(legend, rrb.archetypes.PlotLegend)
+    assert legend.visible is not None
+    return bool(legend.visible.as_arrow_array().to_pylist() != [False])
+
+
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("live", [False, True])
 def test_views_show_exactly_the_written_entities(runs: list[Run], tmp_path: Path, count: int, live: bool) -> None:
@@ -55,7 +67,7 @@ def test_views_show_exactly_the_written_entities(runs: list[Run], tmp_path: Path
     shown = [
         line.removeprefix("+ ").removesuffix("/**")
         for view in views(layout(root_names(runs), live=live).root_container)
-        for line in view.contents
+        for line in entities_of(view)
     ]
 
     def below(path: str, roots: list[str]) -> bool:
@@ -97,16 +109,14 @@ def test_axes_of_a_run_have_the_ranges_of_its_values(runs: list[Run]) -> None:
     assert high >= max(states["effort"].max(), commands["effort"].max()) > 0
     plots = {view.name: view for view in views(layout(ranges=ranges.ranges()).root_container)}
     with_range = [
-        name.partition(":")[0].partition(" ")[0] for name, view in plots.items() if "ScalarAxis" in view.properties
+        str(name).partition(":")[0].partition(" ")[0] for name, view in plots.items() if "ScalarAxis" in view.properties
     ]
     assert with_range == ["Positions", "Velocities", "Efforts"]
 
 
 def test_legends_are_in_titles_and_cover_no_curve() -> None:
     plots = [view for view in views(layout().root_container) if isinstance(view, rrb.TimeSeriesView)]
-    assert [
-        plot.name for plot in plots if plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist() != [False]
-    ] == ["Modbus requests per second"]
+    assert [plot.name for plot in plots if has_legend(plot)] == ["Modbus requests per second"]
     assert plots[0].name == "Positions: θ1 blue, θ2 orange, d3 green, θ4 purple (°; d3 mm)"
 
 

@@ -24,7 +24,7 @@ def log_line(
     monkeypatch.setattr(root, "level", root.level)
     monkeypatch.setattr(ErrorOutput, "write", ErrorOutput.write)
     for module in (sys, threading):
-        monkeypatch.setattr(module, "excepthook", module.excepthook)  # type: ignore[attr-defined]
+        monkeypatch.setattr(module, "excepthook", module.excepthook)
     start_logging(service, "east", log_format)
     logging.captureWarnings(False)
     logging.getLogger("any").warning(text)

@@ -36,7 +36,12 @@ def test_calls_run_in_order_on_the_thread_that_runs_them() -> None:
 
     asking = threading.Thread(target=ask)
     asking.start()
-    eventually(lambda: executor.run_pending() or results)
+
+    def has_run() -> bool:
+        executor.run_pending()
+        return bool(results)
+
+    eventually(has_run)
     asking.join()
     assert threads == results == [threading.main_thread()]
 

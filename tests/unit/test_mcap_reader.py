@@ -9,7 +9,7 @@ import lz4.frame
 import pytest
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import Attachment
+from mcap.records import Attachment, Channel, Schema
 from mcap.records import ChunkIndex as LibraryChunkIndex
 from mcap.stream_reader import StreamReader
 
@@ -135,7 +135,7 @@ def test_chunk_that_states_too_large_a_size_is_damaged() -> None:
 def test_record_must_end_inside_its_chunk(length: int) -> None:
     first, second = encode_message(1, 1, 5, 5, b"first"), bytearray(encode_message(1, 2, 6, 6, b"second"))
     struct.pack_into("<Q", second, 1, length)
-    found = []
+    found: list[Message | Schema | Channel] = []
     with pytest.raises(DamagedError, match=f"of {length} bytes"):
         found.extend(chunk_records(first + bytes(second)))
     assert [item.sequence for item in found if isinstance(item, Message)] == [1]

@@ -114,7 +114,7 @@ def test_rounding_errors_narrow_the_estimate() -> None:
 
 @pytest.mark.parametrize("change", [{"switching": True}, {"at_rest": True}])
 def test_torques_that_show_no_scans_have_no_estimate(change: dict[str, bool]) -> None:
-    device = Device(50.0, 0.0, 0.0, 5, **change)  # type: ignore[arg-type]
+    device = Device(50.0, 0.0, 0.0, 5, **change)
     commands, _ = device.polled()
     commands["effort"] += np.linspace(0, 0.1, len(commands))[:, np.newaxis].round(3) * device.at_rest
     assert estimate(device, commands) is None
@@ -138,7 +138,7 @@ def test_basis_is_never_older_than_the_positions_used(actions: list[str]) -> Non
             used = device
             continue
         if action != "read only":
-            served = ((INCARNATION, step), now_ns)
+            served = ((INCARNATION, step, 0, 0), now_ns)
             edge.add(served)
             if action != "write lost":
                 device = step

@@ -131,7 +131,9 @@ def test_part_released_in_motion_lands_on(target: str, step_ns: int) -> None:
     center, velocity = center_and_velocity(released(), grip)
     bottom = center - (0, 0, HEIGHT / 2)
     stacked = {"part": 1, "stack of two": 2, "stack of three": 3}.get(target, 0)
-    surfaces, parts, trays = [TABLE_TOP], (), ()
+    surfaces = [TABLE_TOP]
+    parts: tuple[PartParameters, ...] = ()
+    trays: tuple[TrayParameters, ...] = ()
     if target == "tray":
         _, (x, y, _) = landing(bottom, velocity, [Surface(0, 0, TABLE + 0.008, half_side=10.0)])
         trays = (TrayParameters("tray", (0.1, 0.1, 0.008), (x, y, TABLE), 0.0, "#404040", ((x, y, TABLE + 0.008),)),)
@@ -170,7 +172,9 @@ def test_held_part_lands_on_a_stack_at_the_time_of_the_reference(stacked: int, s
     q, v = np.array(kinematics.inverse(ARM, (0.51, 0.0, start, 0.0))[0]), np.zeros(4)
     poses = [(0.51, 0.0, start - HEIGHT / 2, 0.0), *((*one.position, one.yaw) for one in parts)]
     plant.set_state(0, q, v, poses, 0)
-    reference, effort, hits, expected = ReferenceArm(ARM, MASS), np.zeros(4), [], []
+    reference, effort = ReferenceArm(ARM, MASS), np.zeros(4)
+    hits: list[tuple[int, float]] = []
+    expected = []
     for _ in range(round(0.12e9 / step_ns)):
         hits += [(event.joint, event.speed) for event in plant.step(effort[:, np.newaxis], ON)]
         q, v = reference.step(q, v, effort, step_ns * 1e-9, ARM.l1 - top - HEIGHT)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from hilrig_recorder.ingest.recording import Recording
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.storage.store import SLOW_SYNC_S, FileStore
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.timing.clock import ManualClock
@@ -76,10 +77,10 @@ def test_name_of_a_segment_is_never_used_again(tmp_path: Path) -> None:
     assert store.open(recording)
     assert [path.name for path in folder.iterdir()] == ["s.2.mcap.part"]
     # The session ends because its owner is silent, and continues later, in a folder that was replaced again.
-    store.close(recording, "keeper lost", "")
+    store.close(recording, Ending.OWNER_LOST, "")
     folder.rename(tmp_path / "moved again")
     again = Recording("rig1", "s", "", "edge/1", 1, 0)
     assert store.open(again)
     assert [path.name for path in folder.iterdir()] == ["s.3.mcap.part"]
-    store.close(again, "ended", "")
+    store.close(again, Ending.ENDED, "")
     store.release()

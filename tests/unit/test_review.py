@@ -291,8 +291,8 @@ def test_alarms_are_the_events_from_warning_up(tmp_path: Path) -> None:
     alarms = {run["name"]: (run["alarms"], run["events"].get("RESET")) for run in found.runs}
     assert alarms == {"alarms": (3, {"ERROR": 1, "INFO": 1}), "other": (0, None)}
     assert re.search(r'data-label="alarms">3</td>', found.html)
-    for severity in ("error", "info"):
-        assert len(re.findall(rf'<td>reset</td><td>{severity}</td><td class="text">text</td>', found.html)) == 1
+    for level in ("error", "info"):
+        assert len(re.findall(rf'<td>reset</td><td>{level}</td><td class="text">text</td>', found.html)) == 1
 
 
 def test_palette_and_log_levels_match_the_schema() -> None:

@@ -2,9 +2,9 @@
 
 import json
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from google.protobuf.message import Message
 
 from hilrig_cli.client import send_control_request
 from hilrig_runtime.config.lab import LabConfig, RigSettings, parse_lab
@@ -109,7 +109,7 @@ class RegistryRig(VirtualRig):
         super().__init__(LAB)
         self.registry = RigRegistry(self.service, self.simulation, OwnerThreadExecutor(lambda run: run()))
 
-    def ask(self, **request: Message) -> str:
+    def ask(self, **request: Any) -> str:
         info = ServiceInfo(service="sim", instance="1", software_version=OWN)
         try:
             return send_control_request(self.service.bus, LAB, info, ControlRequest(**request)).text

@@ -86,8 +86,7 @@ def test_time_axis_uses_the_clock_of_the_states(path: Path) -> None:
 def test_time_axis_continues_across_a_simulation_restart(tmp_path: Path, made: list[TimedMessage]) -> None:
     states = [one for one in made if isinstance(one.message, JointState)]
     for number, one in enumerate(states[100:]):
-        message = JointState()
-        message.CopyFrom(one.message)
+        message = JointState.FromString(one.message.SerializeToString())
         # A new process: steps from 1, and an unrelated clock.
         message.incarnation, message.step = 99, number + 1
         message.sampled_ns -= 4_000_000_000_000

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Channel, Message, Schema
 from mcap.writer import Writer
 
 from hilrig_replay.analysis.latency import measure
@@ -14,7 +15,8 @@ from hilrig_replay.io.sequence_order import Repairs
 from support.recordings import Script, make, record, write
 
 SCRIPT = Script(seconds=20.0, poll_ms=20.0)
-Edit = Callable[[list[tuple]], None]
+Messages = list[tuple[Schema | None, Channel, Message]]
+Edit = Callable[[Messages], None]
 
 
 def rewritten(source: Path, path: Path, edit: Edit) -> Path:
@@ -29,11 +31,12 @@ def rewritten(source: Path, path: Path, edit: Edit) -> Path:
         writer.start()
         for one in metadata:
             writer.add_metadata(one.name, one.metadata)
-        for one in attachments:
-            writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
+        for file in attachments:
+            writer.add_attachment(file.create_time, file.log_time, file.name, file.media_type, file.data)
         channels: dict[int, int] = {}
         for schema, channel, message in messages:
             if channel.id not in channels:
+                assert schema is not None
                 schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
             writer.add_message(
@@ -43,25 +46,25 @@ def rewritten(source: Path, path: Path, edit: Edit) -> Path:
     return path
 
 
-def states_of(messages: list[tuple]) -> list[int]:
+def states_of(messages: Messages) -> list[int]:
     return [number for number, (_, channel, _) in enumerate(messages) if channel.topic == "/state"]
 
 
-def repeat(messages: list[tuple]) -> None:
+def repeat(messages: Messages) -> None:
     messages.insert(states_of(messages)[300] + 5, messages[states_of(messages)[300]])
 
 
-def swap(messages: list[tuple]) -> None:
+def swap(messages: Messages) -> None:
     first, second = states_of(messages)[300:302]
     messages[first], messages[second] = messages[second], messages[first]
 
 
-def move_back(messages: list[tuple]) -> None:
+def move_back(messages: Messages) -> None:
     place = states_of(messages)[100]
     messages.insert(place + 2000, messages.pop(place))
 
 
-def move_forward(messages: list[tuple]) -> None:
+def move_forward(messages: Messages) -> None:
     place = states_of(messages)[900]
     messages.insert(place - 2000, messages.pop(place))
 
@@ -100,7 +103,7 @@ def test_repairs_the_order_across_blocks(tmp_path: Path) -> None:
 
 
 def test_repairs_the_order_of_commands(tmp_path: Path) -> None:
-    def edit(messages: list[tuple]) -> None:
+    def edit(messages: Messages) -> None:
         places = [number for number, (_, channel, _) in enumerate(messages) if channel.topic == "/command"]
         messages.insert(places[200], messages.pop(places[100]))
         messages.insert(places[300], messages[places[300]])
@@ -117,7 +120,7 @@ def test_numbers_of_a_restarted_sender_keep_their_place(tmp_path: Path) -> None:
     made = make(Script(seconds=4.0))
     path = write(tmp_path / "run.mcap", made)
 
-    def restart(messages: list[tuple]) -> None:
+    def restart(messages: Messages) -> None:
         for number, place in enumerate(states_of(messages)[100:]):
             messages[place][2].sequence = number + 1
 

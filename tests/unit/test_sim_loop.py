@@ -1,6 +1,7 @@
 """Unit tests of the simulation loop in simulated time: order, timestamps, states and events."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from support.virtual_rig import VirtualRig
 
 
 @pytest.fixture
-def rig() -> VirtualRig:
+def rig() -> Iterator[VirtualRig]:
     with VirtualRig() as virtual:
         yield virtual
 
@@ -90,8 +91,8 @@ def test_timed_out_command_has_no_age(rig: VirtualRig) -> None:
 
 def test_unknown_basis_gives_no_latency(rig: VirtualRig) -> None:
     rig.tick(2)
-    for options in ({"basis_step": 99}, {"basis_step": 1, "basis_incarnation": 5}, {"basis_step": 0}):
-        rig.command(**options)
+    for step, incarnation in ((99, None), (1, 5), (0, None)):
+        rig.command(basis_step=step, basis_incarnation=incarnation)
         state = rig.tick()
         assert (state.basis_step, state.loop_latency_ns) == (0, 0)
         assert state.command_arrived_ns > 0

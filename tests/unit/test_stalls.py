@@ -36,7 +36,7 @@ def test_event_names_the_stalls_of_its_session(bench: Bench) -> None:
     stall(bench, 187)
     event = bench.events[-1]
     assert (event.kind, event.severity, event.step) == (Event.OVERRUN, Event.WARNING, 3)
-    assert event.session == bench.device.session.id
+    assert event.session == bench.session.id
     assert event.text == "the edge stalled once for 187 ms: its host was overloaded, or it was stopped"
     assert reported(bench) == [(1, 187)]
 

@@ -22,6 +22,7 @@ from hilrig_study.plots import Marker, plane_figure, traces
 from hilrig_study.results import PROVENANCE, provenance, settled_interval
 from hilrig_study.study_config import StudyConfig, load_study
 from hilrig_study.sweep import all_cells, cell_at, run_cells, sweep
+from support.in_process import hilrig_in_process
 from support.rrd_files import RrdFile
 
 ROOT = Path(__file__).parents[2]
@@ -291,11 +292,11 @@ def test_plot_has_theory_traces_and_markers(tmp_path: Path) -> None:
 def test_command_writes_all_result_files(tmp_path: Path) -> None:
     write(tmp_path, SMALL + "[[traces]]\nx = 0\ny = 0.3")
     out = tmp_path / "out"
-    done = CliRunner().invoke(app, ["study", str(tmp_path / "study.toml"), "--out", str(out), "--json"])
-    assert done.exit_code == 0, done.output
+    done = hilrig_in_process("study", tmp_path / "study.toml", "--out", out, "--json")
+    assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary["runs"] == 6
-    assert json.loads((out / "study.json").read_text()) == summary
+    assert {"schema": "hilrig.study/1", **json.loads((out / "study.json").read_text())} == summary
     assert summary["controllers"][0]["settled_interval"] is None
     assert summary["controllers"][0]["cost"] is None
     table = pyarrow.parquet.read_table(out / "runs.parquet")
@@ -343,9 +344,8 @@ def test_settled_share_of_random_runs_has_an_interval(tmp_path: Path) -> None:
 
 def test_command_accepts_controller_file(tmp_path: Path) -> None:
     path, example = write(tmp_path), ROOT / "examples" / "controllers" / "pd.py"
-    arguments = ["study", str(path), "--controller", str(example), "--out", str(tmp_path / "out"), "--json"]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 0, done.output
+    done = hilrig_in_process("study", path, "--controller", example, "--out", tmp_path / "out", "--json")
+    assert done.returncode == 0, done.stderr
     controllers = json.loads(done.stdout)["controllers"]
     assert [controller["name"] for controller in controllers] == ["PD", "pd"]
     assert controllers[1]["theory"] == []

@@ -1,6 +1,7 @@
 """Theory of the loop: linear model against the arm, loop matrix against direct construction, margins against trials."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -249,7 +250,7 @@ def test_loop_is_stable_within_jitter_margin(gain: float) -> None:
     steps = [step_matrix(delay) for delay in range(max_delay + 1)]
     rng = np.random.default_rng(7)
     ascending = list(range(max_delay + 1))
-    patterns = [
+    patterns: list[Iterable[int]] = [
         ascending,
         ascending[::-1],
         [0, max_delay],

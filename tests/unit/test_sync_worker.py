@@ -78,7 +78,7 @@ def test_only_files_with_new_data_are_synced() -> None:
         for size in (1000, 2000):
             writer.size = size
             begin_s = time.monotonic()
-            eventually(lambda size=size: size in writer.synced)
+            eventually(lambda: writer.size in writer.synced)
             duration_s = time.monotonic() - begin_s
         # There were two writes.
         assert writer.synced == [1000, 2000]

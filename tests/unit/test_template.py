@@ -38,6 +38,9 @@ def test_page_is_up_to_date_and_examples_are_valid() -> None:
     assert len(examples) == 5
     assert [rig.name for rig in parse_lab(examples[1]).rigs] == ["left", "right"]
     assert len(parse_lab(examples[2]).rigs) == 65
-    assert parse_lab(examples[3]).classroom.claims == Path("claims")
-    assert len(parse_lab(examples[4]).task.poses) == 2
+    classroom, task = parse_lab(examples[3]).classroom, parse_lab(examples[4]).task
+    assert classroom is not None
+    assert classroom.claims == Path("claims")
+    assert task is not None
+    assert len(task.poses) == 2
     assert tomllib.loads(examples[0])

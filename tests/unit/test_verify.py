@@ -9,7 +9,7 @@ import pytest
 
 from hilrig_replay.analysis.verify import OTHER_PLATFORM_TOLERANCE, verify
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import JointState, TorqueCommand
+from hilrig_schemas import Event, JointState, TorqueCommand
 from hilrig_sim.platform_fingerprint import machine_name
 from support.recordings import TimedMessage, record, write
 from support.virtual_rig import VirtualRig, run_controller
@@ -43,7 +43,7 @@ def copied(made: list[TimedMessage]) -> list[TimedMessage]:
 
 
 def test_verifies_picks_stops_and_a_reset_bit_for_bit(run: list[TimedMessage], tmp_path: Path) -> None:
-    kinds = {one.message.kind for one in run if not isinstance(one.message, JointState)}
+    kinds = {one.message.kind for one in run if isinstance(one.message, Event)}
     assert len(kinds) >= 4
     found = verify(write(tmp_path / "run.mcap", run), tolerance=0.0)
     assert found.same
@@ -168,8 +168,11 @@ def test_finds_a_change_of_each_published_field(
 def test_finds_a_command_that_differs_from_its_state(run: list[TimedMessage], tmp_path: Path) -> None:
     made = commands_of(run)
     assert verify(write(tmp_path / "run.mcap", [*run, *made]), tolerance=0.0).same
-    made[200].message.effort[0] += 0.001
-    made[300].message.magnet ^= True
+    first, second = made[200].message, made[300].message
+    assert isinstance(first, TorqueCommand)
+    assert isinstance(second, TorqueCommand)
+    first.effort[0] += 0.001
+    second.magnet = not second.magnet
     found = verify(write(tmp_path / "run.mcap", [*run, *made]), tolerance=0.0)
     assert not found.same
     assert found.differing == {"effort or magnet of the command": 2}
@@ -236,7 +239,7 @@ def based(made: list[TimedMessage]) -> list[TimedMessage]:
 
 def commands_of(made: list[TimedMessage]) -> list[TimedMessage]:
     """Return the commands that act at the states."""
-    commands = {}
+    commands: dict[tuple[str, int], TimedMessage] = {}
     for one in made:
         state = one.message
         if isinstance(state, JointState) and state.command_seq and not state.safe:

@@ -124,7 +124,7 @@ def test_tip_inside_a_part_holds_it_at_its_height(table_m: float, tray: bool) ->
         assert plant.world.z[0, 0] - 0.015 == pytest.approx(base, abs=1e-8)
     # A plant restored from the recorded pose is bit-identical.
     world, again = plant.world, Plant([RigParameters(scene=scene)])
-    pose = tuple(float(of[0, 0]) for of in (world.x, world.y, world.z, world.yaw))
+    pose = (float(world.x[0, 0]), float(world.y[0, 0]), float(world.z[0, 0]), float(world.yaw[0, 0]))
     again.set_state(0, plant.position[:, 0], plant.velocity[:, 0], [pose], held=0)
     lifted = hold(plant)
     lifted[2] -= 1.0

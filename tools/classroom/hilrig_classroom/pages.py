@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hilrig_classroom.assignment import Assignment
-from hilrig_classroom.gradebook import feedback, similarity, used_attempt
+from hilrig_classroom.gradebook import feedback, used_attempt
 from hilrig_replay.io.segments import RunFiles
 from hilrig_replay.report import assets
 from hilrig_replay.report.report import build_report
@@ -63,9 +63,12 @@ def similar_groups(document: Mapping[str, Any]) -> list[str]:
     for group in {id(group): group for group in group_of.values() if len(group) > 1}.values():
         runs = [run for row in document["students"] if row["id"] in group for run in row["similar"]]
         files = sorted({f"{run['student']}: {run['other_file']}" for run in runs})
-        kinds = dict.fromkeys(similarity(run) for run in sorted(runs, key=lambda run: -run["share"]))
-        texts = list(kinds)
-        sentences.append(f"{'; '.join(files)}: {texts[0] if len(texts) == 1 else f'{texts[0]} to {texts[-1]}'}")
+        percent = sorted({int(100 * run["share"]) for run in runs if not run["same_recording"]})
+        texts = ["the same recording"] if any(run["same_recording"] for run in runs) else []
+        texts += (
+            [f"{' to '.join(map(str, dict.fromkeys((percent[0], percent[-1]))))} % same torques"] if percent else []
+        )
+        sentences.append(f"{'; '.join(files)}: {'; '.join(texts)}")
     return sorted(sentences)
 
 
@@ -167,7 +170,7 @@ def _class_row(student: Student, row: Mapping[str, Any], page: str) -> str:
     if attempt is not None and row["penalty"] is None:
         notes.append("too late")
     if attempt is not None and attempt["data_quality"]:
-        notes.append(f"latency not valid: {attempt['data_quality']}")
+        notes.append("latency not valid")
     notes += [f"{each['file']}: {each['problem']}" for each in row["attempts"] if each["problem"]]
     if row["similar"]:
         notes.append("see runs to compare")

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics
@@ -169,8 +169,8 @@ class Plant:
     def set_state(
         self,
         rig: int,
-        position: Sequence[float],
-        velocity: Sequence[float],
+        position: ArrayLike,
+        velocity: ArrayLike,
         parts: Sequence[tuple[float, float, float, float]] | None = None,
         held: int = NO_PART,
     ) -> None:

@@ -45,6 +45,7 @@ def grade(
     from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.roster import read_roster
+    from hilrig_runtime.errors import list_names
     from hilrig_runtime.escaping import printable
 
     task, people = load_assignment(assignment), read_roster(roster)
@@ -67,10 +68,11 @@ def grade(
         for path, export in exports:
             print(f"{printable(str(path))}: {export.filled} grades for {export.system}")
     for path, export in exports:
-        for key in export.unknown:
-            print(f"{printable(str(path))}: {printable(key)} is not in the roster; row unchanged", file=sys.stderr)
-        for one in export.absent:
-            print(f"{printable(str(path))}: student {one} has no row", file=sys.stderr)
+        # A course may have more students than the roster.
+        for listed, text in ((export.unknown, "not in the roster, rows unchanged"), (export.absent, "without a row")):
+            if listed:
+                students = f"{len(listed)} student{'s' * (len(listed) > 1)} {text}: {list_names(listed, 40)}"
+                print(printable(f"{path}: {students}"), file=sys.stderr)
     for problem in problems:
         print(printable(problem), file=sys.stderr)
     if problems:

@@ -134,7 +134,7 @@ def aggregate(reports: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[
 
 
 def rounded(value: float, interval: Interval | None) -> str:
-    """A value as text, with no digit finer than the width of its interval.
+    """A value as text, with no digit finer than the width of its interval; "<10": it is less than half of that.
 
     None: the interval is not known; with `MAX_DECIMALS` decimals, whole from 1,000 on so that it fits a terminal.
     """
@@ -143,7 +143,8 @@ def rounded(value: float, interval: Interval | None) -> str:
     width = interval[1] - interval[0] if interval[1] < math.inf else value - interval[0]
     exponent = math.floor(math.log10(width)) if width > 0 else -MAX_DECIMALS
     decimals = min(-exponent, MAX_DECIMALS)
-    return f"{round(value, decimals):.{max(decimals, 0)}f}"
+    near = round(value, decimals)
+    return f"<{10.0**-decimals:g}" if not near and value > 0 else f"{near:.{max(decimals, 0)}f}"
 
 
 def cells(statistics: Statistics, intervals: Mapping[str, Interval] | None = None) -> list[str]:

@@ -259,10 +259,12 @@ def _session_and_origin(summary: RunSummary) -> str:
 
 def _facts(page: _Page) -> str:
     summary = page.summary
-    facts = [(f"{summary.duration_s:.1f} s", f"duration; {summary.ended or 'unknown ending'}")]
+    # Without the name of the setting.
+    ended = summary.ended.partition(" (")[0]
+    facts = [(f"{summary.duration_s:.1f} s", f"duration; {ended or 'unknown ending'}")]
     if summary.grade is not None:
         facts.append((f"{summary.grade.percent} %", f"task: {summary.grade.headline()}"))
-    if summary.placement is not None:
+    if summary.placement is not None and (summary.grade is None or summary.grade.parts):
         error = summary.placement.largest_error_mm
         within = "none placed" if error is None else f"largest error {error:.1f} mm"
         facts.append((f"{summary.placement.placed} of {len(summary.placement.parts)}", f"parts placed; {within}"))

@@ -19,6 +19,10 @@ from hilrig_runtime.errors import OperationError
 MEMORY_LIMIT: Final = "1GB"
 """Memory limit of the viewer, above which it drops the oldest data."""
 START_TIMEOUT_S: Final = 30.0
+WINDOW_TIMEOUT_S: Final = 0.5
+"""Time in which a viewer that can't open its window exits; it accepts connections before that."""
+NO_DISPLAY: Final = "the rerun viewer could not open its window: it needs a display; without one use --save or --web"
+_DISPLAY_VARIABLES: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _POLL_S: Final = 0.05
 
 
@@ -62,6 +66,16 @@ def open_viewer(grpc_port: int, web_port: int | None = None) -> "subprocess.Pope
         raise OperationError(f"the rerun viewer can't be started: {error}") from error
 
 
+def check_display() -> None:
+    """Check that this host has a display on which the viewer can open its window.
+
+    Raises:
+        OperationError: it has none.
+    """
+    if sys.platform not in ("win32", "darwin") and not any(map(os.environ.get, _DISPLAY_VARIABLES)):
+        raise OperationError(NO_DISPLAY)
+
+
 @contextmanager
 def running_viewer(grpc_port: int, web_port: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
     """Run the viewer, ready to receive data, and terminate it on exit; the web page is served through `csp_proxy`.
@@ -69,10 +83,16 @@ def running_viewer(grpc_port: int, web_port: int | None = None) -> Iterator["sub
     Raises:
         OperationError: the viewer does not start; the display may be missing.
     """
+    if web_port is None:
+        check_display()
     page_port = None if web_port is None else free_port()
     process = open_viewer(grpc_port, page_port)
     try:
         wait_until_ready(process, [grpc_port, *([] if page_port is None else [page_port])])
+        if web_port is None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(WINDOW_TIMEOUT_S)
+                raise OperationError(NO_DISPLAY)
         with ExitStack() as proxy:
             if page_port is not None and web_port is not None:
                 proxy.enter_context(serve_with_csp(page_port, grpc_port, web_port))
@@ -97,9 +117,7 @@ def wait_until_ready(process: "subprocess.Popen[bytes]", ports: Sequence[int]) -
     for port in ports:
         while True:
             if process.poll() is not None:
-                raise OperationError(
-                    "the rerun viewer exited during start-up; it needs a display (without one use --save or --web)"
-                )
+                raise OperationError(NO_DISPLAY)
             with closing(socket.socket()) as probe:
                 probe.settimeout(1.0)
                 if probe.connect_ex((LOOPBACK, port)) == 0:

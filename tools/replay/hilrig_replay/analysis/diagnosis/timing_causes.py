@@ -31,6 +31,9 @@ MAX_WAIT_SPREAD: Final = 0.02
 """Largest interquartile range of a wait, as a share of it: computations vary more."""
 MAX_ROUND_WAIT_SPREAD: Final = 0.06
 """The same for a wait of a multiple of `ROUND_NS`, as programs contain it."""
+MAX_EARLY_SPREAD: Final = 0.015
+"""Largest difference of the 25th and the 5th percentile of a wait of a multiple of `ROUND_NS`, as a share of it: on a
+busy host a sleep is often longer than requested, but never shorter. Of a computation, it is the standard deviation."""
 MAX_TIMER_SPREAD: Final = 0.2
 """The same if the cycle is kept with absolute deadlines."""
 MIN_CORRECTION: Final = 0.2
@@ -155,12 +158,10 @@ def wait_before_write(evidence: Evidence) -> Finding | None:
             wait_ms=held_ns / MS,
             cycle_ms=_median(cycles["cycle_ns"]) / MS,
         )
-    if not _waits_before_writing(evidence, cycles):
+    wait_ms = _wait_ns(evidence, cycles) / MS
+    if not wait_ms:
         return None
-    held_ns = _median(cycles["held_ns"]) - evidence.min_rtt_ns
     gain_ns = evidence.saved_ns(lambda rows: _computing_ns(evidence, rows))
-    # Without the time of the requests, if it is known.
-    wait_ms = (held_ns - held_ns % ROUND_NS if _is_round(held_ns) else held_ns) / MS
     return _cause(
         evidence,
         "wait_before_write",
@@ -172,17 +173,25 @@ def wait_before_write(evidence: Evidence) -> Finding | None:
     )
 
 
-def _waits_before_writing(evidence: Evidence, cycles: Rows) -> bool:
-    """Whether the time between reading and writing is a wait: constant, without another one after the write."""
+def _wait_ns(evidence: Evidence, cycles: Rows) -> float:
+    """Wait between reading and writing, ns: constant, without another one after the write; 0: it is not a wait.
+
+    Without the time of the requests, if the wait is a multiple of `ROUND_NS`.
+    """
     if len(cycles) < 3:
-        return False
-    low, held, high = np.percentile(cycles["held_ns"], (25, 50, 75)) - evidence.min_rtt_ns
+        return 0.0
+    shortest, low, held, high = (np.percentile(cycles["held_ns"], (5, 25, 50, 75)) - evidence.min_rtt_ns).tolist()
     if held < MIN_DELAY_NS or _median(cycles["pause_ns"]) - evidence.min_rtt_ns > max(NO_PAUSE_NS, 0.1 * held):
-        return False
-    spread = (high - low) / held
+        return 0.0
+    if _is_round(shortest) and low - shortest < MAX_EARLY_SPREAD * held:
+        return float(shortest - shortest % ROUND_NS)
     if _keeps_deadlines(cycles["cycle_ns"]):
-        return bool(spread < MAX_TIMER_SPREAD)
-    return bool(spread < (MAX_ROUND_WAIT_SPREAD if _is_round(held) else MAX_WAIT_SPREAD))
+        largest = MAX_TIMER_SPREAD
+    else:
+        largest = MAX_ROUND_WAIT_SPREAD if _is_round(held) else MAX_WAIT_SPREAD
+    if high - low >= largest * held:
+        return 0.0
+    return float(held - held % ROUND_NS if _is_round(held) else held)
 
 
 def _keeps_deadlines(cycle_ns: Floats) -> bool:
@@ -201,7 +210,8 @@ def _reads_unsynchronized(evidence: Evidence, cycles: Rows) -> bool:
 
 
 def _is_round(wait_ns: float) -> bool:
-    return wait_ns % ROUND_NS < MAX_OVERSLEPT_NS
+    """Whether a wait is a multiple of `ROUND_NS`, beside the time of the requests."""
+    return wait_ns > ROUND_NS and wait_ns % ROUND_NS < MAX_OVERSLEPT_NS
 
 
 def _computing_ns(evidence: Evidence, rows: Rows) -> Floats:

@@ -90,7 +90,7 @@ class View {
 class Arm {
   constructor(run) {
     this.run = run;
-    const scene = run.scene, span = 1.05 * scene.span, low = Math.min(scene.table, scene.bottom) - 40;
+    const scene = run.scene, span = 1.1 * scene.span, low = Math.min(scene.table, scene.bottom) - 40;
     this.above = new View("from above", (x, y) => [x, y], [-span, span, -span, span]);
     this.side = new View("from the side (x, z)", (x, y, z) => [x, z], [-span, span, low, scene.shoulder + 130]);
     this.figures = [this.above.figure, this.side.figure];
