@@ -66,7 +66,7 @@ test-long: .venv/dev ## tests that take minutes: 2,000 forged recordings, packet
 	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_pick_and_place.py tests/rig/test_demo_slow_network.py tests/rig/test_study_live.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py tests/rig/test_installation.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_exercises.py tests/unit/test_assign_check.py tests/unit/test_class_of_30.py tests/rig/test_interactive_report.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_compose.py tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_compose.py tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py tests/hosts/test_attacks_between_hosts.py
 	$(BIN)/python tests/chaos.py
 	$(MAKE) --no-print-directory docs
 

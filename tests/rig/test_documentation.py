@@ -43,6 +43,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "hilrig play": "tests/rig/test_recorder_play.py",
     "hilrig record ": "tests/rig/test_recorder_process.py",
     "hilrig study examples/": "tests/rig/test_study_live.py",
+    "hilrig study --from": "tests/rig/test_study_live.py",
     "make demo": "tests/rig/test_demo.py",
     "python3 -m venv": "tests/rig/test_installation.py",
     ". .venv/bin/activate": "tests/rig/test_installation.py",

@@ -294,6 +294,20 @@ def test_sleep_on_a_busy_host_is_a_wait(sleeps: bool, code: str) -> None:
     assert not sleeps or found.evidence["wait_ms"] == 30
 
 
+@pytest.mark.parametrize(("decay_s", "found"), [(1.6, False), (60.0, True)])
+def test_oscillation_that_decays_after_each_move_is_no_limit_cycle(decay_s: float, found: bool) -> None:
+    time_s = np.arange(1000) * 0.02
+    since_s = time_s % 2.0
+    states = np.zeros(1000, STATE_DTYPE)
+    states["step"], states["session"], states["command_seq"] = np.arange(1000), 1, np.arange(1, 1001)
+    states["effort"][:, 0] = 1.0
+    angle = np.exp(-since_s / decay_s) * np.cos(2 * np.pi * 1.5 * since_s)
+    states["position"][:, 0] = 0.3 * angle
+    states["velocity"][:, 0] = np.gradient(0.3 * angle, 0.02)
+    observed = control_observations.limit_cycle(evidence([replace(EMPTY, states=states)]), [])
+    assert [one.code for one in observed] == ["limit_cycle"] * found
+
+
 def test_writes_after_the_first_one_are_no_wait() -> None:
     commands = np.zeros(400, COMMAND_DTYPE)
     # A read every 100 ms, and a write 1 ms later and again every 20 ms.

@@ -21,6 +21,7 @@ from hilrig_replay.analysis.intervals import (
 )
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
+from support.in_process import hilrig_in_process
 from support.recordings import Script, record
 
 
@@ -132,3 +133,16 @@ def test_report_has_the_intervals_of_loop_stages_and_age(tmp_path: Path) -> None
     for quantity in ("loop", "age"):
         for name, (low, high) in plain["intervals_ms"][quantity].items():
             assert low <= plain[f"{quantity}_ms"][name] <= (math.inf if high is None else high)
+
+
+def test_table_of_runs_fits_a_terminal_of_80_characters(tmp_path: Path) -> None:
+    names = [f"20261201T01133{number}Z-rig1-abcd" for number in range(6)]
+    for number, name in enumerate(names):
+        record(tmp_path / f"{name}.mcap", Script(seconds=1.0, poll_ms=20.0 + 7 * number, seed=number))
+    table = hilrig_in_process("latency", tmp_path).stdout.partition(f"{names[0]}: ")[0]
+    assert max(map(len, table.splitlines())) <= 80
+    assert "…" not in table
+    # Names are folded.
+    labels = "".join(line[1:17].strip() for line in table.splitlines())
+    assert all(name in labels for name in names)
+    assert labels.endswith("median overruns95 % interval,fromto")

@@ -94,9 +94,9 @@ def offset_of(info: ServiceInfo, reply: Reply, wall_ns: Callable[[], int]) -> Cl
     return ClockOffset(f"{info.service}/{info.instance}", info.wall_ns - middle_wall_ns, half_ns)
 
 
-def list_services(bus: Bus, lab: LabConfig) -> list[ServiceInfo]:
-    """Query the running services of a lab; sorted by service and instance."""
-    replies = query_services(bus, lab.name, "*", Counters(), QUERY_TIMEOUT_S, may_serve=lab.bus.may_serve)
+def list_services(bus: Bus, lab: LabConfig, service: str = "*") -> list[ServiceInfo]:
+    """Query the running services of a lab, of one kind or of all; sorted by service and instance."""
+    replies = query_services(bus, lab.name, service, Counters(), QUERY_TIMEOUT_S, may_serve=lab.bus.may_serve)
     found = [info for info, _ in replies]
     return sorted(found, key=lambda info: (info.service, info.instance, info.incarnation))
 
@@ -134,6 +134,7 @@ class PeerRegistry:
 
     `rigs` returns the name and address of each of its rigs; `on_conflict` gets the reason why the service must stop.
     `may_serve` returns whether a service may serve a rig according to its certificate: other claims are ignored.
+    `received` returns the services from which it has received messages, in any thread.
     """
 
     def __init__(
@@ -146,6 +147,7 @@ class PeerRegistry:
         on_conflict: Callable[[str], None],
         counters: Counters,
         may_serve: Callable[[str, str], bool] = lambda _source, _rig: True,
+        received: Callable[[], Iterable[str]] = tuple,
     ) -> None:
         self.clock_offset = ClockOffset()
         self.hosts: dict[str, str] = {}
@@ -160,6 +162,7 @@ class PeerRegistry:
         self._on_conflict = on_conflict
         self._counters = counters
         self._may_serve = may_serve
+        self._received = received
         self._claimed = False
         self._closing = False
         self._peers_down = PeerDownTracker()
@@ -213,6 +216,7 @@ class PeerRegistry:
         for rig, address in self._rigs():
             own.rigs.append(rig)
             own.addresses.append(address)
+        own.received.extend(self._received())
         own.wall_ns = self._clock.wall_ns()
         return own
 

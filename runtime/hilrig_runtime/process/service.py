@@ -90,14 +90,22 @@ class Service(Handle):
         """Called on SIGHUP, in any thread; set by the edge."""
         self.addresses: Callable[[str], str] = lambda _: ""
         """Returns the address of a rig for the service info; set by the edge."""
+        self.last_received: Callable[[], Mapping[str, int]] = dict
+        """Returns the arrival of the last message of each other service, monotonic clock, ns; set by the services."""
         self._registry = PeerRegistry(
-            bus, lab.name, info, self._rigs_reached, clock, self.fail, self.counters, lab.bus.may_serve
+            bus,
+            lab.name,
+            info,
+            self._rigs_reached,
+            clock,
+            self.fail,
+            self.counters,
+            lab.bus.may_serve,
+            received=lambda: sorted(self.last_received()),
         )
         self._closing.callback(self._registry.close)
         self.health.clock_offset = lambda: self._registry.clock_offset
         self.health.peers = self._peer_reports
-        self.last_received: Callable[[], Mapping[str, int]] = dict
-        """Returns the arrival of the last message of each other service, monotonic clock, ns; set by the recorder."""
 
     def claim(self) -> None:
         """Check, before anything is published, that no other service of its kind has one of its rigs or its name.

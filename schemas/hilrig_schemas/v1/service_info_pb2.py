@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n$hilrig_schemas/v1/service_info.proto\x12\thilrig.v1\"\x9f\x01\n\x0bServiceInfo\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\x10\n\x08instance\x18\x02 \x01(\t\x12\x13\n\x0bincarnation\x18\x03 \x01(\x04\x12\x0c\n\x04host\x18\x04 \x01(\t\x12\x18\n\x10software_version\x18\x05 \x01(\t\x12\x0f\n\x07wall_ns\x18\x06 \x01(\x03\x12\x0c\n\x04rigs\x18\x07 \x03(\t\x12\x11\n\taddresses\x18\x08 \x03(\tb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n$hilrig_schemas/v1/service_info.proto\x12\thilrig.v1\"\xb1\x01\n\x0bServiceInfo\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\x10\n\x08instance\x18\x02 \x01(\t\x12\x13\n\x0bincarnation\x18\x03 \x01(\x04\x12\x0c\n\x04host\x18\x04 \x01(\t\x12\x18\n\x10software_version\x18\x05 \x01(\t\x12\x0f\n\x07wall_ns\x18\x06 \x01(\x03\x12\x0c\n\x04rigs\x18\x07 \x03(\t\x12\x11\n\taddresses\x18\x08 \x03(\t\x12\x10\n\x08received\x18\t \x03(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,5 +32,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.service_i
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_SERVICEINFO']._serialized_start=52
-  _globals['_SERVICEINFO']._serialized_end=211
+  _globals['_SERVICEINFO']._serialized_end=229
 # @@protoc_insertion_point(module_scope)

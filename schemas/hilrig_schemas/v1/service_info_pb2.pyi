@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class ServiceInfo(_message.Message):
-    __slots__ = ("service", "instance", "incarnation", "host", "software_version", "wall_ns", "rigs", "addresses")
+    __slots__ = ("service", "instance", "incarnation", "host", "software_version", "wall_ns", "rigs", "addresses", "received")
     SERVICE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
@@ -16,6 +16,7 @@ class ServiceInfo(_message.Message):
     WALL_NS_FIELD_NUMBER: _ClassVar[int]
     RIGS_FIELD_NUMBER: _ClassVar[int]
     ADDRESSES_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
     service: str
     instance: str
     incarnation: int
@@ -24,4 +25,5 @@ class ServiceInfo(_message.Message):
     wall_ns: int
     rigs: _containers.RepeatedScalarFieldContainer[str]
     addresses: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., wall_ns: _Optional[int] = ..., rigs: _Optional[_Iterable[str]] = ..., addresses: _Optional[_Iterable[str]] = ...) -> None: ...
+    received: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., wall_ns: _Optional[int] = ..., rigs: _Optional[_Iterable[str]] = ..., addresses: _Optional[_Iterable[str]] = ..., received: _Optional[_Iterable[str]] = ...) -> None: ...

@@ -129,9 +129,9 @@ class PublisherTracker:
         return publisher
 
     def last_received(self) -> dict[str, int]:
-        """Arrival of the last batch of each source, monotonic clock, ns."""
+        """Arrival of the last batch of each source, monotonic clock, ns; safe from any thread."""
         last: dict[str, int] = {}
-        for publisher in self._publishers.values():
+        for publisher in list(self._publishers.values()):
             last[publisher.name] = max(last.get(publisher.name, 0), publisher.last_ns)
         return last
 

@@ -160,7 +160,8 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("run", overflow="fold")
+    # Of a terminal of 80 characters, what the figures leave.
+    table.add_column("run", overflow="fold", min_width=14)
     for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("valid")
@@ -181,16 +182,14 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
         texts = ["–" if found is None else rounded(found["median"], found["interval"]) for found in medians]
         table.add_row("median over runs", "", *texts, "", style="bold")
         if any(found and found["interval"] for found in medians):
-            texts = ["–" if not (found and found["interval"]) else _range(found["interval"]) for found in medians]
-            table.add_row("its 95 % interval", "", *texts, "")
+            for bound, label in enumerate(("95 % interval, from", "to")):
+                texts = [
+                    "–" if not (found and found["interval"]) else rounded(found["interval"][bound], found["interval"])
+                    for found in medians
+                ]
+                table.add_row(label, "", *texts, "")
     console.print(table)
     for name, report in reports.items():
         note = report.reason_text() or ", ".join(finding.code.replace("_", " ") for finding in report.findings)
         if note:
             console.print(Text(f"{name}: {'' if report.fit else 'not valid: '}{note}"))
-
-
-def _range(interval: tuple[float, float]) -> str:
-    from hilrig_replay.analysis.intervals import rounded
-
-    return " to ".join(rounded(bound, interval) for bound in interval)

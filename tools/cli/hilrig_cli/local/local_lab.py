@@ -13,10 +13,12 @@ from typing import Final
 
 from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, ProcessSpec, Supervisor
 from hilrig_runtime.addresses import format_address, listen_hint, listen_reason
+from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import MESH_ORDER
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.process.discovery import list_services
 from hilrig_schemas.topics import alive_key
 
 POLL_S: Final = 0.05
@@ -109,13 +111,28 @@ def _wait_until_ready(
         bus.subscribe_liveliness(
             alive_key(lab.name, "*", "*"), lambda key, alive: missing.discard(key) if alive else None
         )
-        while missing and not stopping.is_set():
+        while not stopping.is_set():
             supervisor.poll()
+            reason = f"not on the bus: {', '.join(sorted(missing))}" if missing else unrecorded(bus, lab, processes)
+            if not reason:
+                return
             if time.monotonic() > deadline_s:
-                raise OperationError(
-                    f"the lab is not ready after {READY_TIMEOUT_S:.0f} s; not on the bus: {', '.join(sorted(missing))}"
-                )
+                raise OperationError(f"the lab is not ready after {READY_TIMEOUT_S:.0f} s; {reason}")
             time.sleep(POLL_S)
+
+
+def unrecorded(bus: Bus, lab: LabConfig, processes: Sequence[ProcessSpec]) -> str:
+    """Describe the services whose messages do not arrive at a recorder yet; empty: a session would be recorded now.
+
+    A service that stops before the recorder has connected to it would take its messages along.
+    """
+    expected = {f"{spec.service}/{spec.instance}" for spec in processes if spec.service != "recorder"}
+    recorders = {spec.instance for spec in processes if spec.service == "recorder"}
+    infos = [info for info in list_services(bus, lab, "recorder") if info.instance in recorders]
+    if len(infos) < len(recorders):
+        return "a recorder does not reply"
+    waiting = [(info.instance, sorted(expected.difference(info.received))) for info in infos]
+    return "; ".join(f"recorder/{name} receives nothing from {', '.join(silent)}" for name, silent in waiting if silent)
 
 
 def free_ports(first: int, count: int = 1) -> int:

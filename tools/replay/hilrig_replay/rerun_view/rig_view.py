@@ -112,6 +112,7 @@ class RerunRigWriter:
         self._known_clients: set[str] = set()
         self.client_role = False
         """Whether the edge is the client of the controller; known with the first loop latency."""
+        self.largest_age_ms = 0.0
         self._stages: tuple[Stage, ...] = ()
         """Stages of the role; empty: not known yet."""
         self._last_tip: NDArray[np.float64] | None = None
@@ -263,6 +264,7 @@ class RerunRigWriter:
         self._had_age = bool(aged[-1])
         if shown.any():
             ages_ms = np.where(aged, age_ns / 1e6, np.nan)[shown]
+            self.largest_age_ms = max(self.largest_age_ms, float(age_ns.max()) / 1e6)
             self._scalars(paths.LOOP_AGE, self._times(states[shown]), ages_ms[:, None])
 
     def _add_pose(self, times: list[rr.TimeColumn], q: NDArray[np.float64]) -> None:

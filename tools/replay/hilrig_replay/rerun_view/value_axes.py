@@ -44,12 +44,13 @@ class ValueRanges:
 
     def add(self, records: Records) -> None:
         """Add the states and commands of a block."""
-        self._add(paths.POSITION, records.states["position"] * JOINT_SCALE)
-        self._add(paths.VELOCITY, records.states["velocity"] * JOINT_SCALE)
-        self._add(paths.EFFORT, records.states["effort"])
-        self._add(paths.EFFORT, records.commands["effort"])
+        self.extend(paths.POSITION, records.states["position"] * JOINT_SCALE)
+        self.extend(paths.VELOCITY, records.states["velocity"] * JOINT_SCALE)
+        self.extend(paths.EFFORT, records.states["effort"])
+        self.extend(paths.EFFORT, records.commands["effort"])
 
-    def _add(self, path: str, values: ArrayLike) -> None:
+    def extend(self, path: str, values: ArrayLike) -> None:
+        """Add values to the plot with a path."""
         finite = np.asarray(values, np.float64)
         finite = finite[np.isfinite(finite)]
         if len(finite):

@@ -9,6 +9,7 @@ from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
+from hilrig_replay.rerun_view import entity_paths as paths
 from hilrig_replay.rerun_view.layout import layout
 from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
 from hilrig_replay.rerun_view.sinks import flush_file, to_file, to_viewer
@@ -90,6 +91,7 @@ def _write(
                 if file is not None:
                     flush_file(stream, file)
             view.end()
+            ranges.extend(paths.LOOP_AGE, [view.largest_age_ms])
             client_role = view.client_role
         stream.send_blueprint(layout(root_names(runs), client_role=client_role, ranges=ranges.ranges()))
     stream.disconnect()

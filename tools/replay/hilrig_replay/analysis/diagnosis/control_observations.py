@@ -47,6 +47,10 @@ MIN_BAND_SHARE: Final = 0.6
 """Smallest share of the variance at the frequency and its harmonics."""
 MAX_GROWTH: Final = 2.5
 """Largest ratio of the amplitudes of the two halves of a piece."""
+MIN_SWING_RATIO: Final = 0.85
+"""Smallest median ratio of consecutive swings: those after a move decay."""
+MIN_SWING_SHARE: Final = 0.2
+"""Smallest swing, as a share of the amplitude."""
 
 MIN_STOP_SHARE: Final = 0.05
 
@@ -178,6 +182,11 @@ def _oscillation(position: Floats, step_s: float, lowest_hz: float) -> tuple[flo
         return None
     first, second = (float(half.std()) for half in (moved[: count // 2], moved[count // 2 :]))
     if min(first, second) * MAX_GROWTH < max(first, second):
+        return None
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(moved))) != 0) + 1
+    swings = np.abs(np.diff(moved[turns]))
+    swings = swings[swings > MIN_SWING_SHARE * amplitude]
+    if len(swings) < 2 or np.median(swings[1:] / swings[:-1]) < MIN_SWING_RATIO:
         return None
     power = np.abs(np.fft.rfft(moved * np.hanning(count))) ** 2
     frequency = np.fft.rfftfreq(count, step_s)
