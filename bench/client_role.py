@@ -183,7 +183,7 @@ def add_requests(report: Report, seconds: float) -> None:
 
 @dataclass
 class Errors:
-    """Differences from what the devices know, ms; a value for each device."""
+    """Differences from the own values of the devices, ms; a value for each device."""
 
     basis: list[float] = field(default_factory=list)
     scan_time: list[float] = field(default_factory=list)

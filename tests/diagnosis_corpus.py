@@ -5,7 +5,7 @@ changed after their result. `judged` has other laws and set points, and ranges t
 were written down before the first run of that part. Causes that need real processes are in
 `tests/rig/test_diagnosis_live.py`.
 
-    python tests/diagnosis_corpus.py [PART] [RUNS]    prints the table of docs/diagnosis.md
+    python tests/diagnosis_corpus.py [PART] [RUNS] [CAUSE …]    prints the table of docs/diagnosis.md
 """
 
 import sys
@@ -547,11 +547,15 @@ class Result:
         return bool(self.timing) or bool(self.control and self.control[0] not in {code, *self.case.allowed})
 
 
-def diagnosed(cases: Sequence[Case]) -> Iterator[Result]:
-    """Run and diagnose cases."""
+def diagnosed(cases: Sequence[Case], *, by_cause: bool = False) -> Iterator[Result]:
+    """Run and diagnose cases.
 
-    def key(case: Case) -> tuple[float, float]:
-        return case.program.step_ms, case.program.seconds
+    Runs that are simulated together have the same sub-steps, which depend on the fastest motion. With `by_cause` these
+    are the runs of one cause, so that a result does not depend on the other causes.
+    """
+
+    def key(case: Case) -> tuple[str, float, float]:
+        return case.code if by_cause else "", case.program.step_ms, case.program.seconds
 
     for _, group in groupby(sorted(cases, key=key), key):
         together = list(group)
@@ -587,7 +591,8 @@ def table(results: Sequence[Result]) -> str:
 
 if __name__ == "__main__":
     selected, count = sys.argv[1:2] or ["judged"], int((sys.argv[2:] or [str(RUNS)])[0])
-    judged = list(diagnosed(corpus(selected[0], count)))
+    wanted = [one for one in corpus(selected[0], count) if one.code in (sys.argv[3:] or CODES)]
+    judged = list(diagnosed(wanted, by_cause=True))
     print(table(judged))
     for one in judged:
         if one.wrong or not one.found:

@@ -114,6 +114,23 @@ def test_lost_simulation_is_explained_on_each_host(
 
 
 @LONG
+def test_each_host_is_checked_for_its_own_service(lab: MultiHostLab) -> None:
+    def checks(host: str) -> tuple[str, list[str]]:
+        findings = json.loads(lab.run(host, "doctor", "--json", "-c", str(lab.config)).stdout)["findings"]
+        return host, [one["check"] for one in findings]
+
+    own = {
+        "edge": {"ports", "open files", "punctuality"},
+        "sim": {"punctuality"},
+        "recorder": {"disk"},
+        "router": set(),
+    }
+    with ThreadPoolExecutor() as threads:
+        for host, found in threads.map(checks, COMMANDS):
+            assert {"ports", "open files", "punctuality", "disk"} & set(found) == own[host], host
+
+
+@LONG
 def test_dead_router_is_explained_on_each_host(lab: MultiHostLab) -> None:
     lab.kill("router")
     try:

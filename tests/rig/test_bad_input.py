@@ -121,10 +121,24 @@ def test_missing_package_is_named(tmp_path: Path, package: str, command: str, ex
     assert line.endswith(f"-m pip install '.[{extra}]'")
 
 
-def test_invalid_usage_is_exit_code_2() -> None:
-    assert hilrig("latency").returncode == 2
-    assert hilrig("nonsense").returncode == 2
-    assert hilrig("demo", "--duration", "-5").returncode == 2
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("latency", "missing argument 'RUN.MCAP…'; see hilrig latency --help"),
+        ("nonsense", "no such command 'nonsense'; see hilrig --help"),
+        ("demo --duration -5", "--duration: must be ≥ 1, got '-5'; see hilrig demo --help"),
+        ("up --edges x", "--edges: must be an integer, got 'x'; see hilrig up --help"),
+        ("rig list --jsn", "no such option: --jsn (Possible options: --json); see hilrig rig list --help"),
+        ("impair rig1 --loss 2", "--loss: rate: must be ≤ 1, got '2'"),
+        ("registers --csv --json", "--csv, --markdown and --json can't be combined: use one of them"),
+        ("check nowhere.toml", "nowhere.toml: no such file"),
+        ("recover nowhere.mcap", "nowhere.mcap: no such file"),
+    ],
+)
+def test_invalid_usage_is_one_line_and_exit_code_2(command: str, message: str) -> None:
+    done = hilrig(*command.split())
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"hilrig: error: {message}\n"
 
 
 def test_every_command_has_help() -> None:

@@ -38,7 +38,7 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path) -> None:
         for word in ("gamma mean 15 ms", "gilbert", "(override, seed 3)"):
             assert word in table.stdout
         for options, message in (
-            (("rig1", "--command", "constant:-3"), "delay_ms: must be ≥ 0, got '-3'"),
+            (("rig1", "--command", "constant:-3"), "--command: delay_ms: must be ≥ 0, got '-3'"),
             (("rig1", "--preset", "wlan"), "unknown preset 'wlan'; must be one of none, wired"),
             (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
             (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),

@@ -163,6 +163,18 @@ def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tup
     assert done.stderr.endswith("hilrig: error: unknown rig 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
+@pytest.mark.parametrize("words", [("top", "--once"), ("rig", "list"), ("lease",), ("impair",)], ids=" ".join)
+def test_tables_of_a_lab_fit_80_columns(
+    lab: RunningLab, controller: ModbusTcpClient, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    table = hilrig(*words, "--config", lab.config).stdout
+    assert max(map(len, table.splitlines())) <= 80
+    assert "…" not in table
+    # No value is broken.
+    assert words[0] not in ("top", "lease") or re.search(r"\brig4 +127\.0\.0\.1:\d+ ", table)
+
+
 def test_live_without_a_display_is_reported_as_in_replay(lab: RunningLab, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)

@@ -116,6 +116,16 @@ def test_replay_writes_a_file_readable_by_rerun(run: Path, tmp_path: Path) -> No
     assert RrdFile(tmp_path / "run.rrd").rows("/position") == 600
 
 
+@pytest.mark.parametrize(
+    "command", ["latency {run}", "latency {run} {run}", "compare {run} {run}", "runs {folder}", "registers", "example"]
+)
+def test_tables_fit_80_columns(run: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    table = hilrig(*command.format(run=run, folder=run.parent).split()).stdout
+    assert max(map(len, table.splitlines())) <= 80
+    assert "…" not in table
+
+
 def test_replay_rejects_save_with_web(run: Path, tmp_path: Path) -> None:
     result = hilrig("replay", run, "--save", tmp_path / "run.rrd", "--web")
     assert result.returncode == 2

@@ -1,11 +1,15 @@
 """A wall clock that is set during a run changes no time axis."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
+from hilrig_recorder.mcap_format.recover import recover
 from hilrig_replay.analysis.index import RunIndex
+from hilrig_replay.export.export import export_foxglove
 from hilrig_replay.export.player import Player
 from hilrig_replay.io.run import Run, open_run
 from support import recordings
@@ -44,11 +48,38 @@ def test_recorded_steps_of_hours_are_removed(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").symlink_to(RECORDED)
     [entry] = RunIndex(tmp_path).load()
     assert entry.duration_s == pytest.approx(17.7, abs=0.1)
-    offsets_s = [scheduled.offset_ns / 1e9 for scheduled in Player(run.file)]
+    offsets_s = [scheduled.offset_ns / 1e9 for scheduled in Player(run)]
     assert len(offsets_s) == sum(run.file.counts.values())
     assert offsets_s[-1] == pytest.approx(17.7, abs=0.1)
     assert (np.diff(offsets_s) < 0.5).all()
     assert len(run.between(5.0, 10.0).states) == 250
+
+
+def test_steps_are_removed_without_the_end_of_a_file(tmp_path: Path) -> None:
+    truncated, path = tmp_path / "run.mcap", tmp_path / "recovered.mcap"
+    truncated.write_bytes(RECORDED.read_bytes()[:150_000])
+    recover(truncated, path)
+    run = open_run(path)
+    assert run.has_clock_steps
+    assert len(run.between(5.0, 10.0).states) == 250
+    offsets_s = [scheduled.offset_ns / 1e9 for scheduled in Player(run)]
+    assert len(offsets_s) == sum(run.file.counts.values())
+    assert offsets_s[-1] == pytest.approx(run.duration_s, abs=0.2)
+
+
+def test_export_for_viewers_has_no_steps(tmp_path: Path) -> None:
+    path = export_foxglove(open_run(RECORDED), tmp_path / "foxglove.mcap")
+    with path.open("rb") as stream:
+        times_ns = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
+    assert np.ptp(times_ns) / 1e9 == pytest.approx(17.7, abs=0.1)
+
+
+def test_impossible_publication_time_does_not_stop_a_player(tmp_path: Path) -> None:
+    made = recordings.make(Script(seconds=1.0))
+    made[40:] = [replace(one, publish_wall_ns=one.publish_wall_ns + 10**18) for one in made[40:]]
+    schedule = list(Player(open_run(recordings.write(tmp_path / "run.mcap", made))))
+    assert len(schedule) == len(made)
+    assert schedule[-1].offset_ns < 2e9
 
 
 @pytest.mark.parametrize(
@@ -61,7 +92,7 @@ def test_generated_steps_are_removed(tmp_path: Path, steps: list[tuple[float, fl
     for name in ("states", "commands"):
         times = [one.time_s(getattr(one, name)) for one in (run, expected)]
         assert np.abs(times[0] - times[1]).max() < 0.05, name
-    offsets_s = [scheduled.offset_ns / 1e9 for scheduled in Player(run.file)]
+    offsets_s = [scheduled.offset_ns / 1e9 for scheduled in Player(run)]
     assert 0 <= offsets_s[0] <= offsets_s[-1] < 6.5
 
 

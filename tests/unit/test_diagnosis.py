@@ -295,7 +295,7 @@ def test_sleep_on_a_busy_host_is_a_wait(sleeps: bool, code: str) -> None:
 
 
 @pytest.mark.parametrize(("decay_s", "found"), [(1.6, False), (60.0, True)])
-def test_oscillation_that_decays_after_each_move_is_no_limit_cycle(decay_s: float, found: bool) -> None:
+def test_oscillation_that_decays_is_no_limit_cycle(decay_s: float, found: bool) -> None:
     time_s = np.arange(1000) * 0.02
     since_s = time_s % 2.0
     states = np.zeros(1000, STATE_DTYPE)

@@ -14,9 +14,10 @@ import pytest
 
 from hilrig_cli.doctor import CheckResult, Level, host, services
 from hilrig_cli.doctor.certificates import check_certificates
+from hilrig_cli.doctor.host_services import check_here, parse_kinds, services_elsewhere
 from hilrig_cli.doctor.processes import LocalProcess, RouterState
 from hilrig_runtime.config.lab import LabConfig, parse_lab
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.process.discovery import ClockOffset
 from hilrig_runtime.security.x509 import Credential, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.timing.realtime import realtime_priority
@@ -412,3 +413,46 @@ def test_missing_certificate_of_a_command_is_named(folder: Path) -> None:
     assert "does not contain operator.key or viewer.key" in only_error(results)
     assert "viewer" in results[0].fix
     assert joined is None
+
+
+ROUTER_HERE = "[bus]\ntopology = 'router'\nrouter = 'tcp/127.0.0.1:7447'\n"
+
+
+def test_lab_without_a_router_runs_on_this_host() -> None:
+    assert services_elsewhere(LabConfig(), services.BusSnapshot(), []) == {}
+
+
+def test_host_is_not_checked_for_an_edge_with_another_address() -> None:
+    # 192.0.2.0/24 is reserved for documentation: no host has such an address.
+    lab = parse_lab(f"{ROUTER_HERE}[edge]\nhost = '192.0.2.7'\n")
+    assert services_elsewhere(lab, services.BusSnapshot(), []) == {"edge": "edge.host is 192.0.2.7"}
+    # Its process proves that it runs here.
+    assert services_elsewhere(lab, services.BusSnapshot(), [LocalProcess("edge", 1, is_stopped=False)]) == {}
+    [found] = check_here({"edge": "edge.host is 192.0.2.7"}, [], ())
+    assert found.text == (
+        "services that it is checked for: sim, recorder, router; not checked for edge: edge.host is 192.0.2.7"
+    )
+
+
+def test_host_is_not_checked_for_services_without_certificate(tmp_path: Path) -> None:
+    folder = tmp_path / "bus"
+    make_bus_folder(folder, ["recorder", "viewer"])
+    routed = ROUTER_HERE.replace("tcp/127.0.0.1", "tls/192.0.2.9")
+    lab = parse_lab(f"{routed}[bus.tls]\nfolder = '{folder}'\n")
+    found = services_elsewhere(lab, services.BusSnapshot(), [])
+    missing = f"{folder} has no certificate for it"
+    assert found == {"sim": missing, "edge": missing, "router": "bus.router is on 192.0.2.9"}
+
+
+def test_host_is_not_checked_for_a_service_that_runs_on_another() -> None:
+    snapshot = services.BusSnapshot(healths={"sim/1": Health(service="sim", instance="1", host="left")})
+    assert services_elsewhere(parse_lab(ROUTER_HERE), snapshot, []) == {"sim": "runs on left"}
+
+
+def test_named_services_must_run_on_this_host() -> None:
+    chosen = parse_kinds("edge, recorder")
+    assert set(services_elsewhere(LabConfig(), services.BusSnapshot(), [], chosen)) == {"sim", "router"}
+    results = list(check_here({}, [LocalProcess("edge", 1, is_stopped=False)], chosen))
+    assert only_error(results) == "recorder is named with --here, but has no process on this host"
+    with pytest.raises(InputError, match="--here: expected services of sim, edge, recorder, router"):
+        parse_kinds("simulation")

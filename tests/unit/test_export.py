@@ -3,12 +3,14 @@
 import errno
 import json
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
+from google.protobuf.wrappers_pb2 import BytesValue
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -17,11 +19,14 @@ from hilrig_recorder.mcap_format.records import COPY_SUFFIX
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export.export import export_foxglove, export_tables
+from hilrig_replay.export.player import Player, publish_recording
 from hilrig_replay.geometry.quaternion import rotate
 from hilrig_replay.geometry.urdf_geometry import VisualShape, visual_shapes
 from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.run import open_run
+from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters
 from support import recordings
@@ -203,6 +208,19 @@ def test_recording_without_urdf_is_rejected(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(type(run), "urdf", "")
     with pytest.raises(InputError, match="no URDF"):
         export_foxglove(run, tmp_path / "fox.mcap")
+
+
+def test_message_that_cannot_be_decoded_is_damage(tmp_path: Path) -> None:
+    made = recordings.make(recordings.Script(seconds=1))
+    # Not UTF-8 in a text field.
+    made[50:50] = [recordings.TimedMessage("event", made[50].publish_wall_ns, BytesValue(value=b"\xff"))]
+    run = open_run(recordings.write(tmp_path / "run.mcap", made))
+    with pytest.raises(InputError, match=r"damaged \(a message can't be decoded"):
+        export_foxglove(run, tmp_path / "fox.mcap")
+    assert list(tmp_path.iterdir()) == [run.path]
+    bus, clock = MemoryBus(), SYSTEM_CLOCK
+    with pytest.raises(InputError, match="hilrig recover"):
+        publish_recording(bus, "lab", Player(run, speed=100.0), clock, threading.Event(), rename="rig9")
 
 
 def test_command_prints_paths_and_does_not_overwrite(recording: Path, tmp_path: Path) -> None:

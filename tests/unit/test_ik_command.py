@@ -43,4 +43,4 @@ def test_unreachable_pose_has_its_reason_and_exit_code_1() -> None:
 def test_unknown_rig_is_reported() -> None:
     done = CliRunner().invoke(app, ["ik", "300", "0", "0", "0", "--rig", "x"])
     assert isinstance(done.exception, InputError)
-    assert "unknown rig 'x': expected one of rig1" in str(done.exception)
+    assert "unknown rig 'x'; this lab has rig1" in str(done.exception)

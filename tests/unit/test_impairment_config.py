@@ -102,7 +102,7 @@ def test_trace_file_has_one_delay_per_line(tmp_path: Path) -> None:
         ("1\n-3\n", r"line 2: .* got '-3'"),
         ("1\n2,5\n", r"line 2: .* got '2,5'"),
         ("# nothing\n", r"contains no delay"),
-        (None, r"can't be read: No such file"),
+        (None, "no such file"),
     ],
 )
 def test_trace_with_invalid_line_is_rejected(tmp_path: Path, lines: str | None, complaint: str) -> None:

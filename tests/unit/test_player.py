@@ -42,7 +42,7 @@ class ManualEvent(threading.Event):
 
 @pytest.mark.parametrize("speed", [1.0, 0.5, 10.0])
 def test_schedule_restores_the_publication_intervals(run: Run, speed: float) -> None:
-    schedule = list(Player(run.file, speed=speed))
+    schedule = list(Player(run, speed=speed))
     assert len(schedule) == len(MADE)
     first = MADE[0].publish_wall_ns
     assert [each.message.publish_time for each in schedule] == [one.publish_wall_ns for one in MADE]
@@ -51,7 +51,7 @@ def test_schedule_restores_the_publication_intervals(run: Run, speed: float) -> 
 
 
 def test_playback_starts_at_start_s(run: Run) -> None:
-    schedule = list(Player(run.file, start_s=1.0))
+    schedule = list(Player(run, start_s=1.0))
     first = MADE[0].publish_wall_ns + 1_000_000_000
     assert len(schedule) == sum(one.publish_wall_ns >= first for one in MADE)
     assert 0 <= schedule[0].offset_ns < 20_000_000
@@ -59,7 +59,7 @@ def test_playback_starts_at_start_s(run: Run) -> None:
 
 def test_loop_restarts_after_the_end(run: Run) -> None:
     length = len(MADE)
-    schedule = list(islice(Player(run.file, loop=True), 3 * length))
+    schedule = list(islice(Player(run, loop=True), 3 * length))
     assert [schedule[number * length].repetition for number in range(3)] == [0, 1, 2]
     times = [each.offset_ns for each in schedule]
     assert times == sorted(times)
@@ -68,7 +68,7 @@ def test_loop_restarts_after_the_end(run: Run) -> None:
 
 def test_start_after_the_end_is_rejected(run: Run) -> None:
     with pytest.raises(InputError, match="ends before 60 s"):
-        Player(run.file, start_s=60)
+        Player(run, start_s=60)
 
 
 def test_recorded_bytes_are_published_on_schedule(run: Run) -> None:
@@ -82,7 +82,7 @@ def test_recorded_bytes_are_published_on_schedule(run: Run) -> None:
 
     bus.subscribe("hil/lab/rig1/*", on_message)
     begin = clock.monotonic_ns()
-    assert publish_recording(bus, "lab", Player(run.file, speed=2.0), clock, ManualEvent(clock)) == len(MADE)
+    assert publish_recording(bus, "lab", Player(run, speed=2.0), clock, ManualEvent(clock)) == len(MADE)
     assert received == [(one.topic, one.message.SerializeToString()) for one in MADE]
     first = MADE[0].publish_wall_ns
     for at, one in zip(times, MADE, strict=True):
@@ -93,7 +93,7 @@ def test_rename_changes_keys_and_messages(run: Run) -> None:
     bus, clock = MemoryBus(), ManualClock()
     received: list[bytes] = []
     bus.subscribe(STATE.key("lab", "rig9"), lambda _, payload: received.append(payload))
-    publish_recording(bus, "lab", Player(run.file), clock, ManualEvent(clock), rename="rig9")
+    publish_recording(bus, "lab", Player(run), clock, ManualEvent(clock), rename="rig9")
     states = [JointState.FromString(payload) for payload in received]
     assert {state.rig for state in states} == {"rig9"}
     assert [state.step for state in states] == [one.message.step for one in MADE if isinstance(one.message, JointState)]
@@ -105,7 +105,7 @@ def test_edge_follows_a_playback(run: Run) -> None:
     bus, clock = MemoryBus(), ManualClock()
     states = LatestValueCache(clock, Counters(), {})
     bus.subscribe_newest(STATES.key("lab", "*", "*"), states.on_message, 64)
-    publish_recording(bus, "lab", Player(run.file), clock, ManualEvent(clock), rename="rig9")
+    publish_recording(bus, "lab", Player(run), clock, ManualEvent(clock), rename="rig9")
     newest = states.get("rig9")
     assert newest is not None
     image = StateImage()
@@ -118,11 +118,11 @@ def test_playback_stops_when_stopping_is_set(run: Run) -> None:
     stopping = ManualEvent(clock)
     bus = MemoryBus()
     bus.subscribe("hil/lab/**", lambda *_: stopping.set())
-    assert publish_recording(bus, "lab", Player(run.file, loop=True), clock, stopping) == 1
+    assert publish_recording(bus, "lab", Player(run, loop=True), clock, stopping) == 1
 
 
 def test_all_recorded_topics_are_played(run: Run) -> None:
-    assert {each.topic for each in Player(run.file)} == set(RECORDED)
+    assert {each.topic for each in Player(run)} == set(RECORDED)
 
 
 def test_command_rejects_an_invalid_rig_name(run: Run) -> None:

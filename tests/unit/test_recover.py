@@ -6,6 +6,7 @@ import os
 import random
 import shutil
 import struct
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError, OperationError
 from support import recordings
 from support.labs import hilrig
+from support.recordings import Script, make
 
 START = 1_767_225_600_000_000_000
 HEADER_BYTES = 31
@@ -303,6 +305,18 @@ def test_tail_is_read_without_searching_a_large_range(tmp_path: Path) -> None:
         file.truncate(1 << 40)
     # A range of 1 TiB: reading all of it takes minutes.
     assert read_tail(source, 1 << 60).keys
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_tail_is_that_after_a_clock_step(tmp_path: Path, step_s: int) -> None:
+    script = Script(seconds=10.0)
+    # No message arrives before the time at which a generated run begins.
+    made = [replace(one, publish_wall_ns=one.publish_wall_ns + 7200 * 10**9) for one in make(script)]
+    path = recordings.write(tmp_path / "run.mcap", made, script=script, arrival_lag_ns=step_s * 10**9)
+    found, whole = read_tail(path, 35 * 10**9), read_tail(path, 1 << 60)
+    assert found.last == whole.last
+    assert found.last_ns == whole.last_ns
+    assert len(found.keys) > len(whole.keys) / 4
 
 
 def test_default_path_of_a_recovered_file(tmp_path: Path) -> None:

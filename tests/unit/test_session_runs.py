@@ -44,7 +44,7 @@ def test_segments_are_one_run_in_the_order_of_their_content(whole: Path, tmp_pat
     assert run.duration_s == before.duration_s
     assert measure(run).loop_ms == measure(before).loop_ms
     assert len(run.between(2.0, 6.0).states) == len(before.between(2.0, 6.0).states)
-    assert len(list(Player(run.file))) == len(list(Player(before.file)))
+    assert len(list(Player(run))) == len(list(Player(before)))
 
 
 def test_repeated_messages_are_read_and_counted_once(whole: Path, tmp_path: Path) -> None:

@@ -53,6 +53,10 @@ def read_text(path: Path) -> str:
         if len(content) > MAX_TEXT_BYTES:
             raise InputError(f"{path}: can't be read: larger than {MAX_TEXT_BYTES >> 20} MiB")
         return content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: expected a file, found a folder") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text; save it as UTF-8"
         raise InputError(f"{path}: can't be read: {reason}") from error

@@ -31,6 +31,8 @@ class CertificateStore:
         self._check_authority_complete()
         try:
             folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise OperationError(f"{folder}: expected a folder, found a file") from error
         except OSError as error:
             raise OperationError(f"{folder}: can't be created: {error.strerror}") from error
 

@@ -54,8 +54,11 @@ def example_path(name: str) -> Path:
 
 
 def summary(name: str) -> str:
-    """Return the first line of the comment or docstring at the beginning of a file; empty without one."""
-    for line in example_path(name).read_text(encoding="utf-8", errors="replace").splitlines()[:3]:
+    """Return the first line of the comment or docstring at the beginning of a file; empty without one, or a folder."""
+    path = example_path(name)
+    if path.is_dir():
+        return ""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[:3]:
         for mark in _COMMENT_MARKS:
             if line.startswith(mark) and not line.startswith("#!"):
                 return line.removeprefix(mark).strip().removesuffix("*/").removesuffix("*)").strip('" ')

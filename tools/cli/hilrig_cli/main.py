@@ -99,15 +99,65 @@ app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
 app.add_typer(assign.app, name="assign", rich_help_panel="Analyze recordings")
 
 
-def _unwrap_help(group: typer.Typer) -> None:
-    """Join the lines of each paragraph of the help texts, so that the terminal's width determines the line breaks."""
+EXAMPLES = {
+    "up": "up lab.toml --log-format json",
+    "demo": "demo --duration 20 --out demo-out",
+    "live": "live rig1 -c lab.toml --web",
+    "console": "console -c lab.toml --listen :8050 --password-file password.txt",
+    "top": "top -c lab.toml --once",
+    "metrics": "metrics -c lab.toml --listen 127.0.0.1:9464",
+    "check": "check lab.toml",
+    "doctor": "doctor -c lab.toml",
+    "claim": "claim ABCDE-FGHJK 192.0.2.10:5020",
+    "lease": "lease rig1 rig2 --release -c lab.toml",
+    "events": "events -c lab.toml --rig rig1 --severity warning",
+    "impair": "impair rig1 --command uniform:20,40 --loss 0.01 -c lab.toml",
+    "jitter": "jitter --load --step-ms 10",
+    "registers": "registers --csv > registers.csv",
+    "ik": "ik 300 100 50 90",
+    "certs": "certs certs -c lab.toml --client alice=operator --host 192.0.2.10",
+    "example": "example hold_position.py",
+    "router": "router -c lab.toml",
+    "sim": "sim -c lab.toml",
+    "edge": "edge -c lab.toml --instance left --rigs rig1,rig2",
+    "recorder": "recorder -c lab.toml",
+    "runs": "runs recordings --since 2026-01-31 --sort p99",
+    "latency": "latency run.mcap --plot latency.png",
+    "replay": "replay run.mcap --web",
+    "compare": "compare first.mcap second.mcap --align part_picked --plot both.png",
+    "study": "study study.toml --controller my_controller.py",
+    "report": "report recordings --out report.html",
+    "grade": "grade recordings --assignment 3-two-poses --roster roster.csv",
+    "verify": "verify run.mcap",
+    "recover": "recover run.mcap.part",
+    "join": "join run.mcap run.2.mcap --out joined.mcap",
+    "play": "play run.mcap -c lab.toml --speed 0.5",
+    "export": "export run.mcap --parquet tables",
+    "rig list": "rig list -c lab.toml",
+    "rig add": "rig add guest --port 5100 -c lab.toml",
+    "rig remove": "rig remove guest -c lab.toml",
+    "rig reset": "rig reset rig1 rig2 -c lab.toml",
+    "rig codes": "rig codes --until 11:30 --group A --out codes.csv -c lab.toml",
+    "record start": "record start rig1 -c lab.toml",
+    "record stop": "record stop --all -c lab.toml",
+    "assign check": "assign check 3-two-poses --solution solution.py",
+}
+"""An example of each command, for its help."""
+
+
+def _complete_help(group: typer.Typer, prefix: str = "") -> None:
+    """Add an example to each help text, and join the lines of its paragraphs, so that the terminal breaks them."""
     for command in group.registered_commands:
-        paragraphs = inspect.cleandoc((command.callback and command.callback.__doc__) or "").split("\n\n")
+        assert command.callback is not None
+        paragraphs = inspect.cleandoc(command.callback.__doc__ or "").split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+        name = command.name or command.callback.__name__
+        command.epilog = f"Example: hilrig {EXAMPLES[f'{prefix}{name}']}"
 
 
-for _group in (app, rig.app, record.app, assign.app):
-    _unwrap_help(_group)
+_complete_help(app)
+for _name, _group in (("rig", rig.app), ("record", record.app), ("assign", assign.app)):
+    _complete_help(_group, f"{_name} ")
 
 
 def _print_version(requested: bool) -> None:

@@ -1,5 +1,7 @@
 """The terminal of a command: text from outside is shown, never executed."""
 
+import os
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -20,3 +22,8 @@ class TerminalConsole(Console):
             segment if segment.control else Segment(printable(segment.text, keep="\n"), segment.style)
             for segment in buffer
         )
+
+
+def has_fixed_width() -> bool:
+    """Whether a terminal, or the variable COLUMNS, determines the width of standard output."""
+    return sys.stdout.isatty() or "COLUMNS" in os.environ

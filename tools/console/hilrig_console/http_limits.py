@@ -2,12 +2,11 @@
 
 uvicorn waits for the rest of a request without a limit, and for the TLS handshake for a minute: a client that sends
 half a request on each of a thousand connections would take all file descriptors of the process. Connections that wait
-for a request have limits of their own, and beyond them the oldest one is closed, so that a new browser is served.
+for a request have limits of their own. Beyond a limit the oldest one is closed, so that a new browser is served.
 """
 
 import asyncio
 import ssl
-from collections import Counter
 from typing import Any, Final
 
 import h11
@@ -27,17 +26,12 @@ class ConnectionTable:
     """The connections of one server; at most half of them wait for a request."""
 
     def __init__(self, limit: int = MAX_CONNECTIONS, limit_per_host: int = MAX_CONNECTIONS_PER_HOST) -> None:
-        self.limit = limit
-        self.limit_per_host = min(limit, limit_per_host)
-        self.counts: Counter[str] = Counter()
-        """Open connections by host."""
+        limit_per_host = min(limit, limit_per_host)
+        self.open: PendingConnections[LimitedProtocol] = PendingConnections(limit, limit_per_host)
+        """All connections: many that do not read their responses give way, too."""
         self.waiting: PendingConnections[LimitedProtocol] = PendingConnections(
-            max(1, limit // 2), max(1, self.limit_per_host // 2)
+            max(1, limit // 2), max(1, limit_per_host // 2)
         )
-
-    def is_exceeded(self, host: str) -> bool:
-        """Return whether there are more connections, of a host or in total, than allowed."""
-        return self.counts[host] > self.limit_per_host or self.counts.total() > self.limit
 
 
 class LimitedProtocol(H11Protocol):
@@ -48,7 +42,6 @@ class LimitedProtocol(H11Protocol):
         self._table = table
         self._context = context
         self._host = ""
-        self._is_counted = False
         self._is_secured = context is None
         self._early = b""
         self._handshake: asyncio.Task[None] | None = None
@@ -58,12 +51,9 @@ class LimitedProtocol(H11Protocol):
         """See `asyncio.Protocol.connection_made`."""
         self._host = str((transport.get_extra_info("peername") or ("",))[0])
         self.transport = transport
-        self._table.counts[self._host] += 1
-        self._is_counted = True
+        self._make_room(self._table.open)
         self._wait()
-        if self._table.is_exceeded(self._host):
-            self._drop()
-        elif self._context is None:
+        if self._context is None:
             super().connection_made(transport)
         else:
             self._handshake = self.loop.create_task(self._secure(transport, self._context))
@@ -84,6 +74,17 @@ class LimitedProtocol(H11Protocol):
         """See `H11Protocol.on_response_complete`."""
         super().on_response_complete()
         if self._is_waiting() and not self.transport.is_closing():
+            self._wait()
+
+    def pause_writing(self) -> None:
+        """See `asyncio.Protocol.pause_writing`: the client reads its response slowly."""
+        super().pause_writing()
+        self._stop_waiting()
+
+    def resume_writing(self) -> None:
+        """See `asyncio.Protocol.resume_writing`."""
+        super().resume_writing()
+        if self._is_waiting():
             self._wait()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -109,15 +110,19 @@ class LimitedProtocol(H11Protocol):
             self.data_received(self._early)
 
     def _is_waiting(self) -> bool:
-        """Return whether the rest of a request, or the next one, is missing."""
-        return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+        """Return whether the rest of a request is missing, or the next one after the response was sent."""
+        return self.conn.their_state in (h11.IDLE, h11.SEND_BODY) and not self.flow.write_paused
 
     def _wait(self) -> None:
-        """Start to wait for a request, unless it has begun; close an older connection that waits if there are many."""
+        """Start to wait for a request, unless it has begun."""
         if self._timer is not None:
             return
         self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._drop)
-        oldest = self._table.waiting.add(self, self._host)
+        self._make_room(self._table.waiting)
+
+    def _make_room(self, connections: "PendingConnections[LimitedProtocol]") -> None:
+        """Add the connection; close an older one beyond a limit."""
+        oldest = connections.add(self, self._host)
         if oldest is not None:
             oldest._drop()
 
@@ -137,8 +142,4 @@ class LimitedProtocol(H11Protocol):
     def _forget(self) -> None:
         """Remove the connection from the table: at once, because many may be accepted before it is lost."""
         self._stop_waiting()
-        if self._is_counted:
-            self._is_counted = False
-            self._table.counts[self._host] -= 1
-            if not self._table.counts[self._host]:
-                del self._table.counts[self._host]
+        self._table.open.discard(self)

@@ -128,4 +128,6 @@ def check_health(address: ListenAddress, tls: TlsFiles | None) -> None:
         with opener.open(url + HEALTH_PATH, timeout=HEALTH_TIMEOUT_S):
             return
     except OSError as error:
-        raise OperationError(f"no console answers at {url}/: {getattr(error, 'reason', error)}") from error
+        cause = getattr(error, "reason", error)
+        reason = getattr(cause, "strerror", None) or cause
+        raise OperationError(f"no console answers at {url}/: {reason}; start it: hilrig console") from error

@@ -8,7 +8,7 @@ import errno
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Final
 
@@ -110,14 +110,15 @@ def read_tail(path: Path, tail_ns: int) -> SegmentTail:
                 end = item.metadata.get("ended", "")
             elif isinstance(item, Chunk):
                 chunks.append(item)
-    last_ns = max((chunk.last_ns for chunk in chunks), default=0)
-    for chunk in chunks:
-        if chunk.last_ns >= last_ns - tail_ns:
-            with contextlib.suppress(DamagedError):
-                for item in read_chunk(chunk):
-                    if isinstance(item, Message):
-                        keys.add((item.channel_id, item.sequence, item.publish_time))
-                        last[item.channel_id] = (item.sequence, item.publish_time)
+    last_ns = chunks[-1].last_ns if chunks else 0
+    # Only the chunks after the last step of the wall clock: those before it have times of another clock.
+    newest = list(takewhile(lambda chunk: abs(last_ns - chunk.last_ns) <= tail_ns, reversed(chunks)))
+    for chunk in reversed(newest):
+        with contextlib.suppress(DamagedError):
+            for item in read_chunk(chunk):
+                if isinstance(item, Message):
+                    keys.add((item.channel_id, item.sequence, item.publish_time))
+                    last[item.channel_id] = (item.sequence, item.publish_time)
     return SegmentTail(end, keys, last, last_ns)
 
 
@@ -187,6 +188,8 @@ def _locked(source: Path) -> Iterator[None]:
     """Lock a file against other processes that write or recover it."""
     try:
         file = open_file(source, is_writable=True)
+    except FileNotFoundError:
+        raise InputError(f"{source}: no such file") from None
     except PermissionError:
         # Without write permission the file can still be read, and no recorder of this user writes it.
         yield

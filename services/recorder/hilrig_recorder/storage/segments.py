@@ -47,7 +47,7 @@ def read_session_tail(folder: Path, session: str, number: int, tail_ns: int) -> 
     """Read the last `tail_ns` of a session, from segment `number` backward; after restarts, segments may be short."""
     tail = _read_tail(folder / recording_name(session, number), tail_ns)
     last_ns = tail.last_ns
-    while number > 1 and (not last_ns or last_ns - tail.last_ns < tail_ns):
+    while number > 1 and (not last_ns or abs(last_ns - tail.last_ns) < tail_ns):
         number -= 1
         before = _read_tail(folder / recording_name(session, number), tail_ns)
         last_ns = last_ns or before.last_ns

@@ -29,19 +29,30 @@ def doctor(
         str,
         typer.Option(metavar="NAME", help="With --service: check this instance; default: any."),
     ] = "",
+    here: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND,KIND…",
+            help="Services that this host should run, such as sim,edge; default: of a lab on several hosts, what its "
+            "processes, addresses, certificates and the bus show.",
+        ),
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Check ports, bus, services, controllers, certificates, versions, clocks, limits, disk; print how to fix errors.
 
-    Run it on each host, before or while the lab runs. Exit code 1: at least one error was found.
+    Run it on each host, before or while the lab runs. A host is checked for the services that it should run: ports,
+    open files and controllers for the edge, the disk for the recorder, punctuality for simulation and edge. Exit code
+    1: at least one error was found.
     """
     from hilrig_cli.doctor import Level
+    from hilrig_cli.doctor.host_services import parse_kinds
     from hilrig_cli.json_output.lab import DoctorOutput
     from hilrig_cli.json_output.model import print_json
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    results = _check_service(lab, service, instance) if service else _check_all(lab)
+    results = _check_service(lab, service, instance) if service else _check_all(lab, parse_kinds(here))
     errors = [result for result in results if result.level is Level.ERROR]
     if as_json:
         print_json(DoctorOutput(lab=lab.name, well=not errors, findings=results))
@@ -51,10 +62,10 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _check_all(lab: "LabConfig") -> "list[CheckResult]":
+def _check_all(lab: "LabConfig", chosen: "Collection[str]") -> "list[CheckResult]":
     from importlib.metadata import version
 
-    from hilrig_cli.doctor import CheckResult, host, processes, services
+    from hilrig_cli.doctor import CheckResult, host, host_services, processes, services
 
     text = f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms"
     results = [CheckResult.ok("lab", text)]
@@ -66,18 +77,25 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
         results += services.check_services(lab, joined, local)
     # Without the bus the services are unknown; the checks of this host still run.
     snapshot = joined or services.BusSnapshot()
-    results += services.check_realtime(lab, snapshot)
+    elsewhere = host_services.services_elsewhere(lab, snapshot, local, chosen)
+    results += host_services.check_here(elsewhere, local, chosen)
+    is_timed = not {"sim", "edge"} <= set(elsewhere)
+    if is_timed or snapshot.healths:
+        results += services.check_realtime(lab, snapshot)
     results += services.check_versions(snapshot.healths.values(), version("hilrig"))
     results += services.check_clocks(snapshot.clocks)
     if lab.bus.tls is not None or lab.edge.tls is not None:
         results += _check_certificates(lab)
-    is_edge_stopped = any(one.service == "edge" and one.is_stopped for one in local)
-    results += host.check_ports(lab, snapshot.services, is_edge_stopped=is_edge_stopped)
-    if any(rig.controller is not None for rig in lab.rigs):
-        results += _check_controllers(lab, snapshot.services)
-    results += host.check_open_files(lab)
-    results += host.check_timer_accuracy(lab)
-    results += host.check_disk(lab)
+    if "edge" not in elsewhere:
+        is_edge_stopped = any(one.service == "edge" and one.is_stopped for one in local)
+        results += host.check_ports(lab, snapshot.services, is_edge_stopped=is_edge_stopped)
+        if any(rig.controller is not None for rig in lab.rigs):
+            results += _check_controllers(lab, snapshot.services)
+        results += host.check_open_files(lab)
+    if is_timed:
+        results += host.check_timer_accuracy(lab)
+    if "recorder" not in elsewhere:
+        results += host.check_disk(lab)
     return results
 
 

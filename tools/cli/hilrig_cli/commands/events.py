@@ -86,9 +86,7 @@ def _live(config: Path | None, rigs: list[str]) -> "Iterator[Event]":
     stopping = stop_on_signals()
     with ZenohBus(lab.bus, "tool") as bus:
         if not discover_services(bus, lab, {"edge"}):
-            raise OperationError(
-                f"no service of lab {lab.name!r} found: is it running (hilrig up), with this lab.toml?"
-            )
+            raise OperationError(f"no service of lab {lab.name!r} found: {lab.bus.no_answer_hint}")
         for name in rigs:
             check_rig(bus, lab, name)
         handle = bus.subscribe(EVENT.key(lab.name, "*"), lambda key, payload: received.put((key, payload)))

@@ -22,8 +22,11 @@ def example(
     from hilrig_runtime.errors import InputError, OperationError
 
     if not name:
-        table = Table("example", "content", box=None, header_style="bold")
-        for known in example_names():
+        table = Table(box=None, header_style="bold")
+        table.add_column("example", overflow="fold")
+        table.add_column("content", ratio=1)
+        # Of a project, such as that of a PLC tool, its folders are listed.
+        for known in dict.fromkeys("/".join(name.split("/")[:2]) for name in example_names()):
             table.add_row(known, summary(known))
         TerminalConsole().print(table)
         return
@@ -40,6 +43,8 @@ def example(
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
         else:
             shutil.copyfile(source, target)
+    except FileExistsError as error:
+        raise OperationError(f"{out}: expected a folder, found a file") from error
     except OSError as error:
         raise OperationError(f"{target}: can't be written: {error.strerror}") from error
     print(target)

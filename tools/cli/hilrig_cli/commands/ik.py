@@ -27,7 +27,6 @@ def ik(
     from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.lab import LabConfig, load_lab
-    from hilrig_runtime.errors import InputError
     from hilrig_sim.arm.joints import JOINT_SCALE
     from hilrig_sim.arm.kinematics import UnreachableError, inverse
     from hilrig_sim.parameters import rig_parameters
@@ -35,7 +34,7 @@ def ik(
     lab = LabConfig() if config is None else load_lab(config)
     names = [one.name for one in lab.rigs]
     if rig and rig not in names:
-        raise InputError(f"--rig: unknown rig {rig!r}: expected one of {', '.join(names)}")
+        raise lab.no_such_rig(rig)
     arm = rig_parameters(lab, lab.rigs[names.index(rig) if rig else 0]).arm
     try:
         solutions = (inverse(arm, (x / 1e3, y / 1e3, z / 1e3, math.radians(yaw))) * JOINT_SCALE).tolist()

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -10,11 +10,21 @@ from hilrig_cli.options import AllRigs, AsJson, Config, check_rigs
 
 if TYPE_CHECKING:
     from hilrig_runtime.config.impairment import ImpairmentConfig
+    from hilrig_runtime.errors import InputError
     from hilrig_schemas import ImpairmentStatus
 
 DELAY_SYNTAX = (
     "constant:MS, uniform:LOW,HIGH, normal:MEAN,STD, gamma:MEAN,STD[,OFFSET], exponential:MEAN[,OFFSET], trace:FILE"
 )
+_OPTIONS: Final = {
+    "preset": "--preset",
+    "seed": "--seed",
+    "state.delay": "--state",
+    "command.delay": "--command",
+    "state.loss": "--loss",
+    "command.loss": "--loss",
+}
+"""Options by the keys that they set."""
 LOSS_SYNTAX = "RATE (as bernoulli:RATE), none, bernoulli:RATE or gilbert:TO_BAD,TO_GOOD[,RATE_BAD[,RATE_GOOD]]"
 
 
@@ -83,8 +93,12 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     """
     from hilrig_runtime.config.impairment import ImpairmentConfig
     from hilrig_runtime.config.validation import validate
+    from hilrig_runtime.errors import InputError
 
-    base = validate(ImpairmentConfig, {"preset": preset or "none"}).links
+    try:
+        base = validate(ImpairmentConfig, {"preset": preset or "none"}).links
+    except InputError as error:
+        raise _with_options(error) from error
     delays = {"state": state or base.state.delay, "command": command or base.command.delay}
     if trace is not None:
         from hilrig_replay.export.delay_trace import delay_trace
@@ -98,7 +112,24 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
         loss = f"bernoulli:{loss}"
     losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
     links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
-    return validate(ImpairmentConfig, {"preset": preset or "none", "seed": seed, **links})
+    try:
+        return validate(ImpairmentConfig, {"preset": preset or "none", "seed": seed, **links})
+    except InputError as error:
+        raise _with_options(error) from error
+
+
+def _with_options(error: "InputError") -> "InputError":
+    """Return an error of an impairment with the names of options instead of those of keys, each sentence once."""
+    from hilrig_runtime.errors import InputError
+
+    lines = []
+    for line in str(error).splitlines():
+        place, _, text = line.partition(": ")
+        key = next((key for key in _OPTIONS if place.startswith(key)), "")
+        # The name of a parameter of the delay or loss, such as rate.
+        parameter = place.removeprefix(key).rpartition(".")[2]
+        lines.append(": ".join(filter(None, (_OPTIONS.get(key, ""), parameter, text))))
+    return InputError("\n".join(dict.fromkeys(lines)))
 
 
 def _row(status: "ImpairmentStatus") -> dict[str, object]:

@@ -160,7 +160,7 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    # Of a terminal of 80 characters, what the figures leave.
+    # The width that the figures leave in a terminal of 80 characters.
     table.add_column("run", overflow="fold", min_width=14)
     for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):
         table.add_column(column, justify="right", no_wrap=True)

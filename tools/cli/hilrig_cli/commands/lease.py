@@ -65,14 +65,15 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
 
 
 def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) -> None:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
 
-    table = Table()
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     student = ["student"] if any(status.student for status in statuses) else []
-    for column in ("rig", *student, "lease holder", "last request", "session", "connections", "watchdog"):
-        table.add_column(column, no_wrap=column == "rig", overflow="fold")
+    for column in ("rig", *student, "lease holder", "silent", "session", "clients", "watchdog"):
+        table.add_column(column, no_wrap=column in ("rig", "watchdog"), overflow="fold")
     for status in statuses:
         timeout = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
         holder = f"client of {status.client_of}" if status.client_of else status.holder or "none"
@@ -80,7 +81,7 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) 
             status.rig,
             *([_student(status)] if student else []),
             f"{holder}: {status.controller_fault}" if status.controller_fault else holder,
-            f"{status.silent_ns / 1e9:.1f} s ago" if status.holder else "",
+            f"{status.silent_ns / 1e9:.1f} s" if status.holder else "",
             status.session,
             str(status.connections),
             "tripped" if status.watchdog_tripped else timeout,
@@ -88,9 +89,9 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) 
     console = TerminalConsole()
     console.print(table)
     if release:
-        former = statuses[0].released
-        text = f"lease of {former} revoked: the next other controller that writes acquires it"
-        console.print(text if former else "the rig had no lease holder")
+        for status in statuses:
+            revoked = f"lease of {status.released} revoked: the next other controller that writes acquires it"
+            console.print(f"{status.rig}: {revoked if status.released else 'it had no lease holder'}")
     if end_claim:
         for status in statuses:
             ended = f"claim of {status.claim_ended} ended: it must be claimed again"

@@ -38,8 +38,8 @@ def play(
         opened = open_run(find_run(run))
     name = rig or opened.rig
     if not is_name(name) or name in RESERVED_RIG_NAMES:
-        raise InputError(f"--rig: {name!r} is not a valid rig name")
-    player = Player(opened.file, speed=speed, start_s=start, loop=loop)
+        raise InputError(f"--rig: expected letters, digits, - and _, and no reserved name, got {name!r}")
+    player = Player(opened, speed=speed, start_s=start, loop=loop)
     stopping = stop_on_signals()
     with _bus(lab, name) as bus:
         bus.declare_queryable(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())

@@ -1,10 +1,13 @@
 """`hilrig registers`: prints the register map of a rig as a table, CSV, Markdown or JSON."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from hilrig_cli.options import AsJson
+
+WIDE_TERMINAL_COLUMNS: Final = 100
+"""Minimum width of a terminal in which the addresses are shown, characters."""
 
 
 def registers(
@@ -16,7 +19,10 @@ def registers(
     from hilrig_cli.json_output.lab import RegistersOutput
     from hilrig_cli.json_output.model import print_json
     from hilrig_modbus_edge.registers import export
+    from hilrig_runtime.errors import InputError
 
+    if as_csv + as_markdown + as_json > 1:
+        raise InputError("--csv, --markdown and --json can't be combined: use one of them")
     if as_csv:
         print(export.as_csv(), end="")
     elif as_markdown:
@@ -28,15 +34,21 @@ def registers(
 
 
 def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
+    from itertools import groupby
+
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
 
-    table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "meaning")
-    for row in rows:
-        table.add_row(
-            *(str(row[key]) for key in ("table", "number", "address", "name", "type", "unit", "scale")),
-            "controller" if row["writable"] else "rig",
-            str(row["text"]),
-        )
-    TerminalConsole().print(table)
+    console = TerminalConsole()
+    keys = ("number", *(["address"] if console.width >= WIDE_TERMINAL_COLUMNS else []), "name", "type", "unit", "scale")
+    for name, in_table in groupby(rows, key=lambda row: row["table"]):
+        title = f"{str(name).capitalize()}s; the address in a request is the number minus 1"
+        table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for key in (*keys, "access"):
+            table.add_column(key, no_wrap=True, justify="right" if key in ("number", "address", "scale") else "left")
+        table.add_column("meaning", overflow="fold")
+        for row in in_table:
+            table.add_row(*(str(row[key]) for key in keys), "R/W" if row["writable"] else "R", str(row["text"]))
+        console.print(table)

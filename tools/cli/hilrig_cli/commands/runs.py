@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 ABNORMAL_ENDINGS = ("disk full", "write failed", "keeper lost")
 """Endings that are shown with their reason."""
+FILE_WIDTH = 200
+"""Maximum number of characters per line of output that is not for a terminal."""
 WIDE_TERMINAL_COLUMNS = 130
 """Minimum width of a terminal in which all columns are shown, characters."""
 
@@ -166,27 +168,30 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, has_fixed_width
     from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
     from hilrig_runtime.escaping import printable
 
     if not entries:
         print(printable(f"no matching recordings in {folder}" if read else f"no recordings in {folder}"))
         return
-    console = TerminalConsole() if sys.stdout.isatty() else TerminalConsole(width=200)
+    console = TerminalConsole(width=None if has_fixed_width() else FILE_WIDTH)
     wide = console.width >= WIDE_TERMINAL_COLUMNS
-    table = Table(title=f"Recordings in {folder}", title_justify="left", box=None, pad_edge=False)
-    table.add_column("recording", min_width=20)
+    title, padding = f"Recordings in {folder}", (0, 2 if wide else 1, 0, 0)
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=padding)
+    # The width of the name that the recorder gives to the file of a rig with a short name.
+    table.add_column("recording", min_width=26, overflow="fold")
     if wide:
         table.add_column("rig", no_wrap=True)
         table.add_column("start (UTC)", no_wrap=True)
-    for column in ("duration", "size", "p50 ms", "p99 ms", "age p99", "lost"):
+    # A narrow terminal has no room for the age; losses are in the last column.
+    for column in ("duration", "size", "p50 ms", "p99 ms", *(["age p99", "lost"] if wide else [])):
         table.add_column(column, justify="right", no_wrap=True)
     if wide:
         table.add_column("controller", no_wrap=True)
         table.add_column("verified", no_wrap=True)
     table.add_column("valid", no_wrap=True)
-    table.add_column("ending")
+    table.add_column("ending", min_width=10, overflow="fold")
     for entry in entries:
         lost = _lost(entry)
         start = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
@@ -197,11 +202,10 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
             format_size(entry.size),
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
-            _number(entry.age_p99_ms),
-            Text(str(lost), style="red" if lost else ""),
+            *([Text(_number(entry.age_p99_ms)), Text(str(lost), style="red" if lost else "")] if wide else []),
             *([entry.certificate or entry.controller, _yes_no(entry.verified)] if wide else []),
             _yes_no(entry.fit),
-            _ending(entry),
+            _ending(entry) if wide or not lost else _ending(entry).append(f"; lost: {lost}", style="red"),
         )
     console.print(table)
     if total > len(entries):

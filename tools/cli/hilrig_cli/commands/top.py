@@ -62,12 +62,12 @@ def top(
 
     from hilrig_cli.json_output.lab import TopOutput
     from hilrig_cli.json_output.model import print_json
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, has_fixed_width
     from hilrig_monitoring.lab_watch import LabWatch
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    console = TerminalConsole(width=None if sys.stdout.isatty() else FILE_WIDTH)
+    console = TerminalConsole(width=None if has_fixed_width() else FILE_WIDTH)
     with LabWatch(lab) as watch:
         watch.wait()
         if as_json or once or not sys.stdout.isatty():
@@ -76,7 +76,7 @@ def top(
                     print_json(TopOutput.model_validate({"lab": lab.name} | watch.view.as_dict(time.monotonic())))
                 else:
                     console.print(
-                        render(watch.view, time.monotonic(), None, console.width if sys.stdout.isatty() else None)
+                        render(watch.view, time.monotonic(), None, console.width if has_fixed_width() else None)
                     )
             return
         with Live(console=console, screen=True, auto_refresh=False) as live:

@@ -25,14 +25,14 @@ from hilrig_recorder.mcap_format.records import Message as RecordedMessage
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
-from hilrig_replay.export.copying import copy_metadata, own_messages
+from hilrig_replay.export.copying import copy_metadata, own_messages, without_clock_steps
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
 from hilrig_replay.io.columns import StringTable
 from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.records import Decoder, concatenate_records, enum_name
-from hilrig_replay.io.run import BLOCK_ROWS, Run
+from hilrig_replay.io.run import BLOCK_ROWS, Run, decoding
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.escaping import csv_text
@@ -70,6 +70,8 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
                     rows = rows_of(block)
                     if len(rows):
                         writers[name].write_table(table(run, rows, escape))
+    except FileExistsError as error:
+        raise OperationError(f"{folder}: expected a folder, found a file") from error
     except OSError as error:
         raise OperationError(f"{folder}: can't be written: {error.strerror or error}") from error
     return list(paths.values())
@@ -86,17 +88,20 @@ def export_foxglove(run: Run, path: Path) -> Path:
     (foxglove.Log: the events).
 
     Raises:
-        InputError: the recording has no URDF, or the file exists.
+        InputError: the recording has no URDF or is damaged, or the file exists.
         OperationError: the file can't be written.
     """
     if not run.urdf:
         raise InputError(f"{run.path}: has no URDF attachment, which is needed to draw the arm")
     arm, shapes = parse_arm(run.urdf), visual_shapes(run.urdf)
-    with new_file(path, library="hilrig export") as writer:
+    with new_file(path, library="hilrig export") as writer, decoding(run.path):
         visualization = _Visualization(writer, run, arm, shapes)
         visualization.write_channels()
         copy_metadata(run.file, writer)
         messages = own_messages(run.file)
+        if run.has_clock_steps:
+            # Viewers place messages by their times of arrival.
+            messages = (one._replace(log_time=one.publish_time) for one in without_clock_steps(messages))
         while block := list(islice(messages, BLOCK_ROWS)):
             visualization.prepare(message for message in block if message.channel_id == _STATE_CHANNEL)
             for message in block:

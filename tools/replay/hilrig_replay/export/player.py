@@ -14,8 +14,8 @@ from itertools import count
 from typing import Any, Final
 
 from hilrig_recorder.mcap_format.records import Message
-from hilrig_replay.io.recording_file import RecordingFile
-from hilrig_replay.io.run import Run
+from hilrig_replay.export.copying import REORDER_WINDOW_NS, without_clock_steps
+from hilrig_replay.io.run import Run, decoding
 from hilrig_runtime.bus.api import Bus, Publisher
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.timing.clock import Clock
@@ -23,8 +23,8 @@ from hilrig_schemas import RigBatch, RigConfig
 from hilrig_schemas.topics import RECORDED, STATE, STATES
 
 ALL_TOPICS: Final = frozenset(RECORDED)
-_REORDER_WINDOW_NS: Final = 1_000_000_000
-"""Streams arrive in batches: a message may be stored this long after one that was published later."""
+_MAX_PAUSE_NS: Final = 3_600_000_000_000
+"""A longer time without messages is a step of the clock, or damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class ScheduledMessage:
 
 
 class Player:
-    """Playback schedule of a recording from `start_s`, at `speed` times the original speed; `loop` repeats it.
+    """Playback schedule of a run from `start_s`, at `speed` times the original speed; `loop` repeats it.
 
     Raises:
         InputError: the recording is empty, or shorter than `start_s`.
@@ -48,16 +48,18 @@ class Player:
 
     def __init__(
         self,
-        file: RecordingFile,
+        run: Run,
         *,
         speed: float = 1.0,
         start_s: float = 0.0,
         loop: bool = False,
         topics: frozenset[str] = ALL_TOPICS,
     ) -> None:
+        file = self._file = run.file
         self.rig = file.metadata.get("hilrig.session", {}).get("rig", "") or "rig"
         """Name of the recorded rig."""
-        self._file = file
+        self.path = run.path
+        self._has_clock_steps = run.has_clock_steps
         self._speed = speed
         self._topics = topics
         self._loop = loop
@@ -84,43 +86,22 @@ class Player:
     def _ordered(self, from_publish_ns: int | None) -> Iterator[Message]:
         """Messages in order of publication; only those within the reorder window are held in memory."""
         buffer: list[tuple[int, int, Message]] = []
-        has_steps = bool(int(self._file.metadata.get("hilrig.summary", {}).get("clock_steps", 0)))
+        has_steps = self._has_clock_steps
         from_log_ns = None if from_publish_ns is None or has_steps else self._earliest_arrival(from_publish_ns)
         messages = self._file.messages(self._topics, from_ns=from_log_ns)
-        for number, message in enumerate(_without_clock_steps(messages) if has_steps else messages):
+        longest_ns = REORDER_WINDOW_NS if has_steps else _MAX_PAUSE_NS
+        for number, message in enumerate(without_clock_steps(messages, longest_ns)):
             if from_publish_ns is not None and message.publish_time < from_publish_ns:
                 continue
             heapq.heappush(buffer, (message.publish_time, number, message))
-            while buffer[0][0] < message.publish_time - _REORDER_WINDOW_NS:
+            while buffer[0][0] < message.publish_time - REORDER_WINDOW_NS:
                 yield heapq.heappop(buffer)[2]
         while buffer:
             yield heapq.heappop(buffer)[2]
 
     def _earliest_arrival(self, publish_ns: int) -> int | None:
         # The clocks of sender and recorder may differ: the index is used only if they are consistent.
-        return publish_ns - _REORDER_WINDOW_NS if self._file.start_ns <= publish_ns <= self._file.end_ns else None
-
-
-def _without_clock_steps(messages: Iterator[Message]) -> Iterator[Message]:
-    """The messages with publication times as if the wall clock had not been set.
-
-    Messages are stored within `_REORDER_WINDOW_NS` of their publication: a larger difference of consecutive messages
-    of a channel is a step, except after a pause of both the channel and the recorder.
-    """
-    newest: int | None = None
-    sums: dict[int, int] = {}
-    total = 0
-    for message in messages:
-        step_ns = sums.get(message.channel_id, 0)
-        publish_ns = message.publish_time - step_ns
-        if newest is not None and abs(publish_ns - newest) > _REORDER_WINDOW_NS:
-            # Another channel may have found the step before.
-            if abs(message.publish_time - total - newest) > _REORDER_WINDOW_NS:
-                total = message.publish_time - newest
-            step_ns = sums[message.channel_id] = total
-            publish_ns = message.publish_time - step_ns
-        newest = publish_ns if newest is None else max(newest, publish_ns)
-        yield message._replace(publish_time=publish_ns)
+        return publish_ns - REORDER_WINDOW_NS if self._file.start_ns <= publish_ns <= self._file.end_ns else None
 
 
 def publish_recording(
@@ -146,7 +127,8 @@ def publish_recording(
             if name not in publishers:
                 publishers[name] = closing.enter_context(bus.publisher(topic.key(lab, rig), topic.traffic))
             if rename is not None:
-                message: Any = topic.message.FromString(payload)
+                with decoding(player.path):
+                    message: Any = topic.message.FromString(payload)
                 message.rig = rename
                 payload = message.SerializeToString()
             if topic.name == STATE.name:

@@ -4,6 +4,7 @@ Opening a run reads the metadata of the file; the arrays are read on first acces
 blocks, so one pass needs the same memory for a minute and for a day; `between` reads a time range.
 """
 
+import contextlib
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,6 +41,19 @@ class Losses:
     """Messages that arrived and could not be written."""
     file: int = 0
     """Messages that were written, but are not in the file: it was damaged, truncated or edited."""
+
+
+@contextlib.contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Turn the errors of messages that can't be decoded into damage of the recording.
+
+    Raises:
+        InputError: the block raised such an error.
+    """
+    try:
+        yield
+    except (DecodeError, struct.error, OverflowError) as error:
+        raise DamagedRecordingError(path, f"a message can't be decoded: {error}") from error
 
 
 class Run:
@@ -227,10 +241,20 @@ class Run:
         rows = tables.TABLES[table](self._read_all(table))
         return tables.frame(tables.table(self, rows), library)
 
+    @cached_property
+    def has_clock_steps(self) -> bool:
+        """Whether a wall clock was set during the run; a file without a complete summary is read to find out."""
+        stated = self.number("summary", "clock_steps")
+        if stated is None:
+            for _ in self.blocks(frozenset({"state", "command"})):
+                continue
+            return self.timebase.has_clock_steps
+        return stated > 0
+
     def between(self, from_s: float, until_s: float, topics: frozenset[str] = ALL_TOPICS) -> Records:
         """Messages that were sent in a time range, `until_s` excluded; only that part of the file is read."""
         low, high = (self.start_wall_ns + round(limit * 1e9) for limit in (from_s, until_s))
-        if self.number("summary", "clock_steps"):
+        if self.has_clock_steps:
             # Arrivals are times of a clock that was set: the range is selected by the times on the axis.
             return Records(
                 *(
@@ -277,7 +301,7 @@ class Run:
         decoder = Decoder(self.names, self.timebase)
         topic_of, decode = self.file.topics, decoder.decoders
         count = 0
-        try:
+        with decoding(self.path):
             for channel_id, sequence, log_ns, _, payload in self.file.messages(
                 topics, from_ns=from_ns, until_ns=until_ns
             ):
@@ -287,8 +311,6 @@ class Run:
                     count = 0
                     yield self._checked(decoder.drain())
                     decode = decoder.decoders
-        except (DecodeError, struct.error, OverflowError) as error:
-            raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:
             yield self._checked(decoder.drain())
 

@@ -60,6 +60,11 @@ class Timebase:
         self._sim_clock.update(states["wall_ns"], states["sampled_ns"], self.start_wall_ns)
         self._anchor = (int(states["wall_ns"][-1]), _int64(int(states["step"][-1])))
 
+    @property
+    def has_clock_steps(self) -> bool:
+        """Whether a wall clock was set in the rows that were added."""
+        return self._sim_clock.has_steps or self._edge_clock.has_steps
+
     def time_ns(self, rows: Rows) -> NDArray[np.int64]:
         """Times at which the rows were sent, ns from the first state of the run, shape as `rows`."""
         names = rows.dtype.names or ()
@@ -84,13 +89,13 @@ class Timebase:
     def _wall_ns(self, rows: Rows) -> NDArray[np.int64]:
         """Wall-clock times of rows without the steps of the clock."""
         names = rows.dtype.names or ()
-        clocks = [clock for clock in (self._sim_clock, self._edge_clock) if clock.has_steps]
-        if not clocks:
+        if not self.has_clock_steps:
             return np.asarray(rows["wall_ns"])
         for field in ("sent_ns", "arrived_ns"):
             if field in names and self._edge_base_ns:
                 return np.asarray(rows[field] + self._edge_base_ns)
-        return clocks[0].without_steps(rows["wall_ns"])
+        clock = self._sim_clock if self._sim_clock.has_steps else self._edge_clock
+        return clock.without_steps(rows["wall_ns"])
 
 
 class _WallClock:

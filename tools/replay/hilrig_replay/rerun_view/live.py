@@ -91,7 +91,7 @@ class Follower:
             if self._clock.monotonic_ns() >= deadline_ns:
                 raise OperationError(
                     f"no reply from a simulation of rig {self._rig!r} in lab {self._lab!r}: "
-                    "is it running (hilrig up) with this lab.toml?"
+                    "is it running (hilrig up), with this lab.toml? See hilrig doctor"
                 )
             stopping.wait(0.05)
         return False
