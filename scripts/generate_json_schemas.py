@@ -41,7 +41,7 @@ error. Every object has the key `schema` with the name and the version of its sc
 keys to a version; a key that is removed or renamed, or whose type or meaning changes, needs a new version. NaN and
 infinity do not occur: a value that does not exist is null. Exit codes are the same as without `--json`.
 
-The schemas are JSON Schema, draft 2020-12, in the folder [json](json/). This page is generated from them by `make gen`.
+The schemas are JSON Schema, draft 2020-12, in `docs/json/`. This page is generated from them by `make gen`.
 """
 
 
@@ -61,16 +61,14 @@ def page() -> str:
             f"[`{catalog.schema_name(model)}`](json/{catalog.file_name(model)})" for model in output.models
         )
         lines.append(f"| `hilrig {command}` | {FORMS[output.form]} | {names} |\n")
-    types: dict[str, Any] = {}
     for model in catalog.models():
         schema = catalog.json_schema(model)
-        types |= schema.get("$defs", {})
         lines.append(f"\n## {catalog.schema_name(model)}\n\n{_text(schema)}\n\n{_table(schema)}")
     lines.append("\n## Types\n\nObjects within the outputs. Those of a configuration file are described there:\n")
     lines.append("[lab.toml](configuration.md), [studies](studies.md).\n")
-    for name in sorted(types):
-        if _is_described(name, types[name]):
-            lines.append(f"\n### {name}\n\n{_text(types[name])}\n\n{_table(types[name])}")
+    for name, schema in sorted(_types().items()):
+        if _is_described(name, schema):
+            lines.append(f"\n### {name}\n\n{_text(schema)}\n\n{_table(schema)}")
     return "".join(lines)
 
 
@@ -99,7 +97,8 @@ def _kind(field: dict[str, Any]) -> str:
         return "object"
     if "$ref" in field:
         name = field["$ref"].rpartition("/")[2]
-        return f"[{name}](#{name.lower()})" if _is_described(name, {"type": "object"}) else "object"
+        known = _types().get(name, {"type": "object"})
+        return f"[{name}](#{name.lower()})" if _is_described(name, known) else str(known.get("type", "object"))
     match field.get("type"):
         case "array" if "prefixItems" in field:
             inner = ", ".join(dict.fromkeys(map(_kind, field["prefixItems"])))
@@ -112,6 +111,15 @@ def _kind(field: dict[str, Any]) -> str:
         case str(kind):
             return kind
     return "any"
+
+
+@cache
+def _types() -> dict[str, Any]:
+    """Return the schema of each type within the outputs, by its name."""
+    found: dict[str, Any] = {}
+    for model in catalog.models():
+        found |= catalog.json_schema(model).get("$defs", {})
+    return found
 
 
 def _is_number(field: dict[str, Any]) -> bool:

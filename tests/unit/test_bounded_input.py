@@ -26,7 +26,7 @@ from hilrig_replay.plots.latency_plot import save_plot
 from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.config.impairment import read_trace
 from hilrig_runtime.config.lab import load_lab, parse_lab
-from hilrig_runtime.config.validation import MAX_TEXT_BYTES, read_text
+from hilrig_runtime.config.validation import MAX_TEXT_BYTES, parse_toml, read_text
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import MAX_JSON_CHARACTERS, RigParameters
 from hilrig_study.study_config import load_study
@@ -285,3 +285,9 @@ def test_chunk_of_a_gigabyte_is_not_expanded(tmp_path: Path) -> None:
     assert any("1073741824 bytes uncompressed; expected" in getattr(item, "reason", "") for item in found)
     (tmp_path / "run.mcap").write_bytes(data)
     assert recover(tmp_path / "run.mcap", tmp_path / "new.mcap").messages > 0
+
+
+@pytest.mark.parametrize("text", ["a" + ".a" * 20_000 + " = 1", "x = {a" + ".a" * 20_000 + " = 1}"])
+def test_key_of_thousands_of_parts_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="nested too deeply"):
+        parse_toml(text, "lab.toml")

@@ -146,7 +146,7 @@ def test_ninety_attempts_are_graded_within_a_minute(slot: Path, tmp_path: Path) 
             folder.mkdir(parents=True, exist_ok=True)
             shutil.copy(made[count % len(made)], folder / f"{attempt}.mcap")
             count += 1
-    begin_s, begin = time.monotonic(), os.times()
+    begin_s = time.monotonic()
     done = hilrig(
         "grade",
         recordings,
@@ -159,10 +159,7 @@ def test_ninety_attempts_are_graded_within_a_minute(slot: Path, tmp_path: Path) 
         "--json",
         timeout_s=300,
     )
-    elapsed_s, end = time.monotonic() - begin_s, os.times()
-    used_s = end.children_user + end.children_system - begin.children_user - begin.children_system
+    elapsed_s = time.monotonic() - begin_s
     assert done.returncode == 0, done.stderr
     assert sum(len(row["attempts"]) for row in json.loads(done.stdout)["grades"]["students"]) == 90
-    # Other tests may use the two cores at the same time.
-    print(f"90 attempts: {elapsed_s:.1f} s, of which {used_s:.1f} s on a processor")
-    assert min(elapsed_s, used_s) < 60.0
+    assert elapsed_s < 60.0, f"{elapsed_s:.1f} s"

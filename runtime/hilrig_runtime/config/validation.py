@@ -62,6 +62,10 @@ def read_text(path: Path) -> str:
         raise InputError(f"{path}: can't be read: {reason}") from error
 
 
+MAX_KEY_PARTS: Final = 200
+"""Maximum number of parts of a dotted key."""
+
+
 def parse_toml(text: str, where: str) -> dict[str, Any]:
     """Parse TOML; `where` is the name of the file in messages.
 
@@ -70,6 +74,10 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     """
     if len(text) > MAX_TEXT_BYTES:
         raise InputError(f"{where}: invalid TOML: longer than {MAX_TEXT_BYTES >> 20} MiB")
+    # tomllib needs memory that grows with the square of the parts of a dotted key.
+    parts = (part for line in text.splitlines() for part in line.split("="))
+    if any(part.count(".") > MAX_KEY_PARTS and "," not in part for part in parts):
+        raise InputError(f"{where}: invalid TOML: nested too deeply; a key has more than {MAX_KEY_PARTS} parts")
     try:
         return tomllib.loads(text)
     except RecursionError as error:
