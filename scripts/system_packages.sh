@@ -3,7 +3,7 @@
 # On Debian as root it installs the missing packages; otherwise it reports them and exits with 0, because a test that
 # needs a missing package is skipped with a reason.
 set -eu
-packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl docker-compose xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
+packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl docker-compose nftables xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
 # Libraries that the rerun viewer loads when it opens a window.
 packages="$packages libxkbcommon-x11-0 libxcursor1 libxi6"
 # Node.js may be installed from another source than apt.

@@ -62,7 +62,8 @@ def test_suffixes_of_recordings_are_in_one_module() -> None:
         f"{path.relative_to(ROOT)}:{line}: {value!r}"
         for path in SOURCES
         # The example commands of main.py name files of users.
-        if path not in (FORMAT / "file_names.py", ROOT / "tools/cli/hilrig_cli/main.py") and SUFFIX.search(path.read_text())
+        if path not in (FORMAT / "file_names.py", ROOT / "tools/cli/hilrig_cli/main.py")
+        and SUFFIX.search(path.read_text())
         for line, value in literals(path.read_text())
         if SUFFIX.search(value)
     ]
