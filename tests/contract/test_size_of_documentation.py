@@ -16,8 +16,7 @@ NOT_COUNTED = {"CHANGELOG.md", *(f"docs/project/{path.stem.lower()}.md" for path
 """The changes of each release, and the titles of pages outside docs/ on the site."""
 MAX_WORDS_OF_A_PAGE = 2_000
 MAX_WORDS = 30_000
-"""Of all pages without the decisions."""
-MAX_WORDS_OF_DECISIONS = 4_000
+"""Of all pages."""
 
 
 def words(page: str) -> int:
@@ -38,7 +37,4 @@ def test_no_page_is_long() -> None:
 
 
 def test_documentation_is_short_as_a_whole() -> None:
-    found = pages()
-    decisions = sum(count for page, count in found.items() if page.startswith("docs/adr/"))
-    assert decisions <= MAX_WORDS_OF_DECISIONS
-    assert sum(found.values()) - decisions <= MAX_WORDS
+    assert sum(pages().values()) <= MAX_WORDS
