@@ -15,6 +15,7 @@ from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.index import IN_PROGRESS, INDEX_NAME, RunIndex, read_entry, read_verdict, write_verdict
 from hilrig_runtime.errors import InputError
 from support import recordings
+from support.in_process import hilrig_in_process
 from support.labs import hilrig
 
 SCRIPT = recordings.Script(seconds=1.0)
@@ -226,12 +227,14 @@ def test_command_reports_a_missing_folder_in_one_line(tmp_path: Path) -> None:
     assert "nowhere" in answer.stderr
 
 
-def test_command_shows_the_reason_of_an_abnormal_ending(tmp_path: Path) -> None:
+def test_command_shows_the_reason_of_an_abnormal_ending(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "lab" / "rig1" / "20260101T000000Z-rig1-abcd.mcap"
     path.parent.mkdir(parents=True)
     writer = RecordingWriter(path, metadata=(Metadata("hilrig.session", {"rig": "rig1", "session": path.stem}),))
     writer.finish(lambda: {"hilrig.summary": {"ended": "disk full", "reason": "No space left on device"}})
     writer.publish()
-    answer = hilrig("runs", tmp_path)
-    assert answer.returncode == 0, answer.stderr
-    assert "disk full: No space left on device" in " ".join(answer.stdout.split())
+    for columns in ("80", "81", "150", "240"):
+        monkeypatch.setenv("COLUMNS", columns)
+        answer = hilrig_in_process("runs", tmp_path)
+        assert answer.returncode == 0, answer.stderr
+        assert "disk full: No space left on device" in " ".join(answer.stdout.split())

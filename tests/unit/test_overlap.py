@@ -69,7 +69,7 @@ def test_manual_recording_is_marked_and_not_graded(tmp_path: Path) -> None:
     assert "overlaps with manual" in report.html
     assert "overlaps with controller" in report.html
     assert build_report([two]).runs[0]["grade"] is not None
-    listed = hilrig("runs", tmp_path).stdout
+    listed = " ".join(hilrig("runs", tmp_path).stdout.split())
     assert "overlaps with manual" in listed
     assert "overlaps with controller" in listed
     assert "manual: recorded manually" in hilrig("report", tmp_path, "-o", tmp_path / "r.html").stderr

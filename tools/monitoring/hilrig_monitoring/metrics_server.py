@@ -57,6 +57,9 @@ class MetricsServer(ThreadingHTTPServer):
     def __exit__(self, *_: object) -> None:
         self.shutdown()
         self.server_close()
+        with self._lock:
+            for request in self._deadlines_s:
+                _end(request)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """See `socketserver.BaseServer.process_request`."""

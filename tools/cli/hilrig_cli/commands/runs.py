@@ -165,6 +165,7 @@ def _date(wall_ns: int, form: str) -> str:
 
 
 def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int) -> None:
+    from rich.cells import cell_len
     from rich.table import Table
     from rich.text import Text
 
@@ -179,8 +180,11 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     wide = console.width >= WIDE_TERMINAL_COLUMNS
     title, padding = f"Recordings in {folder}", (0, 2 if wide else 1, 0, 0)
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=padding)
-    # The width of the name that the recorder gives to the file of a rig with a short name.
-    table.add_column("recording", min_width=26, overflow="fold")
+    names = [Path(entry.path).name.removesuffix(MCAP_SUFFIX) for entry in entries]
+    # At least the name that the recorder gives to the file of a rig with a short name.
+    room = console.width - 130 if wide else console.width // 3
+    width = min(max(map(cell_len, names)), max(26, room))
+    table.add_column("recording", width=width, overflow="fold")
     if wide:
         table.add_column("rig", no_wrap=True)
         table.add_column("start (UTC)", no_wrap=True)
@@ -192,11 +196,11 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
         table.add_column("verified", no_wrap=True)
     table.add_column("valid", no_wrap=True)
     table.add_column("ending", min_width=10, overflow="fold")
-    for entry in entries:
+    for name, entry in zip(names, entries, strict=True):
         lost = _lost(entry)
         start = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
         table.add_row(
-            Path(entry.path).name.removesuffix(MCAP_SUFFIX),
+            name,
             *([entry.rig, start] if wide else []),
             _duration(entry.duration_s),
             format_size(entry.size),
