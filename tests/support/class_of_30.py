@@ -112,9 +112,14 @@ def _record(run: _Run, assignment: Path, recordings: Path) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "program.py"
         path.write_text(program, encoding="utf-8")
-        with VirtualLab(lab, recordings, run.start, seed=run.student.number) as virtual:
+        # A folder for each run: two attempts of a student are recorded at the same time.
+        own = Path(folder) / "recordings"
+        with VirtualLab(lab, own, run.start, seed=run.student.number) as virtual:
             virtual.run(path, seconds=8.0)
-            virtual.recording()
+            recording = virtual.recording()
+        target = recordings / recording.parent.relative_to(own)
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.move(recording, target)
 
 
 def _quoted(text: str) -> str:
