@@ -10,7 +10,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -124,7 +124,8 @@ def takes_processor(pid: int, count: int, busy_s: float) -> Iterator[None]:
         subprocess.run([sys.executable, "-c", FIFO_LOAD, *map(str, (max(cores), count, busy_s))], check=True)
     finally:
         for thread in threads:
-            os.sched_setaffinity(thread, cores)
+            with suppress(ProcessLookupError):  # the thread has ended
+                os.sched_setaffinity(thread, cores)
     yield
 
 

@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
@@ -12,6 +13,7 @@ class Forwarder:
     def __init__(self, port: int) -> None:
         self._target = port
         self._listener = socket.create_server(("127.0.0.1", 0))
+        self._open: list[socket.socket] = []
 
     @property
     def port(self) -> int:
@@ -26,8 +28,10 @@ class Forwarder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # A thread that waits in accept() is not woken by close().
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
+        for one in (self._listener, *self._open):
+            with suppress(OSError):  # the other end has closed it
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
 
     def _accept(self) -> None:
         while True:
@@ -36,6 +40,7 @@ class Forwarder:
             except OSError:
                 return
             server = socket.create_connection(("127.0.0.1", self._target))
+            self._open += (client, server)
             for source, target in ((client, server), (server, client)):
                 target.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 threading.Thread(target=_copy, args=(source, target), name="forwarder", daemon=True).start()
