@@ -173,8 +173,8 @@ def test_lists_ten_thousand_indexed_files_quickly(tmp_path: Path) -> None:
         patch.setattr("hilrig_replay.analysis.index.read_entry", lambda *_: pytest.fail("was read again"))
         begin_s = time.process_time()
         assert len(RunIndex(tmp_path).load()) == 10_000
-    # Measured: 0.2 s of processor time, and 2.2 s while coverage is measured beside other busy processes.
-    assert time.process_time() - begin_s < 5
+    # Measured: 0.2 s of processor time; more if caches are shared with another busy process.
+    assert time.process_time() - begin_s < 2
 
 
 @pytest.mark.parametrize(
