@@ -143,6 +143,6 @@ def test_table_of_runs_fits_a_terminal_of_80_characters(tmp_path: Path) -> None:
     assert max(map(len, table.splitlines())) <= 80
     assert "…" not in table
     # Names are folded.
-    labels = "".join(line[1:17].strip() for line in table.splitlines())
+    labels = "".join(line[:18].strip() for line in table.splitlines())
     assert all(name in labels for name in names)
-    assert labels.endswith("median overruns95 % interval,fromto")
+    assert labels.endswith("median over runs95 % interval fromto")

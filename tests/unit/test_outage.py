@@ -91,3 +91,12 @@ def test_different_events_of_a_kind_are_counted_in_the_log(caplog: pytest.LogCap
         log.record(Event(kind=Event.OVERRUN, severity=Event.WARNING, text="late"), 0)
         log.flush()
     assert caplog.messages == ["rig1: a refused (and 1 more of this kind: hilrig events)", "late"]
+
+
+def test_log_message_of_several_rigs_names_the_one_of_its_text(caplog: pytest.LogCaptureFixture) -> None:
+    log = EventLog()
+    with caplog.at_level(logging.INFO):
+        for rig in ("rig2", "rig1", "rig3"):
+            log.record(Event(rig=rig, kind=Event.SESSION_START, text=f"session of {rig} started"), 0)
+        log.flush()
+    assert caplog.messages == ["rig2: session of rig2 started (also rig1, rig3)"]

@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 class EventLog:
-    """Logs events: at most one message a period for each kind, with the text of the first event and all rigs."""
+    """Logs events: at most one message a period for each kind, with the first text and the names of all rigs."""
 
     def __init__(self) -> None:
         self._pending: dict[Event.Kind, list[Event]] = {}
@@ -47,8 +47,12 @@ class EventLog:
     def _flush(self, kind: Event.Kind) -> None:
         events = self._pending.pop(kind)
         first = events[0]
-        rigs = list_names(sorted({event.rig for event in events if event.rig}))
+        rigs = sorted({event.rig for event in events if event.rig})
+        # A text that names its rig, client or session is that of one rig.
+        differ = len({event.text for event in events}) > 1 and len(rigs) > 1
+        place = first.rig if differ else list_names(rigs)
+        also = f" (also {list_names([rig for rig in rigs if rig != first.rig])})" if differ else ""
         others = len({(event.rig, event.text) for event in events}) - len({event.rig for event in events})
         more = f" (and {others} more of this kind: hilrig events)" if others else ""
         level = logging.INFO if first.severity == Event.INFO else logging.WARNING
-        logger.log(level, "%s%s%s", f"{rigs}: " if rigs else "", first.text, more)
+        logger.log(level, "%s%s%s%s", f"{place}: " if place else "", first.text, also, more)

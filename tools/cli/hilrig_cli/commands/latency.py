@@ -159,9 +159,9 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
 
     console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
-    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    # The width that the figures leave in a terminal of 80 characters.
-    table.add_column("run", overflow="fold", min_width=14)
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, show_edge=False)
+    # What the figures leave of 80 characters: the time of a session's name, and its rig in a second line.
+    table.add_column("run", overflow="fold", min_width=18)
     for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("valid")
@@ -174,7 +174,8 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
             else rounded(getattr(statistics, key), report.intervals_ms[quantity].get("p999" if key == "max" else key))
             for quantity, key in columns
         ]
-        table.add_row(name, str(report.samples), *figures, "yes" if report.fit else "no")
+        label = name if console.width > 90 else name.replace("Z-", "Z-\n", 1)
+        table.add_row(label, str(report.samples), *figures, "yes" if report.fit else "no")
     over_runs = aggregate([report.as_dict() for report in reports.values()])
     if over_runs:
         table.add_section()
@@ -182,13 +183,13 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
         texts = ["–" if found is None else rounded(found["median"], found["interval"]) for found in medians]
         table.add_row("median over runs", "", *texts, "", style="bold")
         if any(found and found["interval"] for found in medians):
-            for bound, label in enumerate(("95 % interval, from", "to")):
+            for bound, label in enumerate(("95 % interval from", "to")):
                 texts = [
                     "–" if not (found and found["interval"]) else rounded(found["interval"][bound], found["interval"])
                     for found in medians
                 ]
                 table.add_row(label, "", *texts, "")
-    console.print(table)
+    console.print(table, "")
     for name, report in reports.items():
         note = report.reason_text() or ", ".join(finding.code.replace("_", " ") for finding in report.findings)
         if note:

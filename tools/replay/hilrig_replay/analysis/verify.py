@@ -102,7 +102,8 @@ class Verification:
 
     def sentence(self) -> str:
         """The result as a human-readable sentence."""
-        skipped = f" ({self.skipped} more skipped because of {self.gaps} gaps)" if self.skipped else ""
+        since = f"the start, a reset or one of {self.gaps} gaps" if self.gaps else "the start or a reset"
+        skipped = f" ({self.skipped} more skipped: no state with all parts since {since})" if self.skipped else ""
         if self.steps == 0:
             return f"no step could be re-simulated{skipped}"
         missing = f"; not in the recording, not checked: {', '.join(self.not_checked)}" if self.not_checked else ""
