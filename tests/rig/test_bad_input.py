@@ -124,7 +124,7 @@ def test_missing_package_is_named(tmp_path: Path, package: str, command: str, ex
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("latency", "missing argument 'RUN.MCAP…'; see hilrig latency --help"),
+        ("latency", "missing argument 'RUN.MCAP'; see hilrig latency --help"),
         ("nonsense", "no such command 'nonsense'; see hilrig --help"),
         ("demo --duration -5", "--duration: must be ≥ 1, got '-5'; see hilrig demo --help"),
         ("up --edges x", "--edges: must be an integer, got 'x'; see hilrig up --help"),

@@ -40,8 +40,10 @@ from hilrig_cli.commands.study import study
 from hilrig_cli.commands.top import top
 from hilrig_cli.commands.up import up
 from hilrig_cli.commands.verify import verify
+from hilrig_cli.options import Command, Group
 
 app = typer.Typer(
+    cls=Group,
     name="hilrig",
     help="Hardware-in-the-loop rig for robot control: a virtual SCARA arm over Modbus TCP, recorded and replayed.",
     epilog="Exit codes: 0 success, 1 check failed, 2 invalid usage or input, 3 operation failed, "
@@ -94,9 +96,9 @@ for _panel, _commands in PANELS.items():
         # A negative coordinate is no option.
         _settings = {"ignore_unknown_options": True} if _command is ik else None
         app.command(rich_help_panel=_panel, context_settings=_settings)(_command)
-app.add_typer(rig.app, name="rig", rich_help_panel="Run a lab")
-app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
-app.add_typer(assign.app, name="assign", rich_help_panel="Analyze recordings")
+app.add_typer(rig.app, name="rig", cls=Group, rich_help_panel="Run a lab")
+app.add_typer(record.app, name="record", cls=Group, rich_help_panel="Run a lab")
+app.add_typer(assign.app, name="assign", cls=Group, rich_help_panel="Analyze recordings")
 
 
 EXAMPLES = {
@@ -149,6 +151,7 @@ def _complete_help(group: typer.Typer, prefix: str = "") -> None:
     """Add an example to each help text, and join the lines of its paragraphs, so that the terminal breaks them."""
     for command in group.registered_commands:
         assert command.callback is not None
+        command.cls = Command
         paragraphs = inspect.cleandoc(command.callback.__doc__ or "").split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
         name = command.name or command.callback.__name__

@@ -5,10 +5,10 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 Config = Annotated[
     Path | None,
@@ -19,9 +19,32 @@ Config = Annotated[
         help="Configuration file of the lab; default: one rig with default settings.",
     ),
 ]
-Rigs = Annotated[list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs.")]
+Rigs = Annotated[list[str] | None, typer.Argument(metavar="RIG", help="Names of the rigs.")]
 AllRigs = Annotated[bool, typer.Option("--all", help="All rigs of the running lab.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]
+
+
+class Command(TyperCommand):
+    """A command whose help shows no type for a flag, which takes no value."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Parameters of the command, with those of its help."""
+        return _without_flag_types(super().get_params(ctx))
+
+
+class Group(TyperGroup):
+    """The same for a group of commands."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Parameters of the group, with those of its help."""
+        return _without_flag_types(super().get_params(ctx))
+
+
+def _without_flag_types(params: list[Any]) -> list[Any]:
+    for param in params:
+        if getattr(param, "is_flag", False):
+            param.metavar = ""
+    return params
 
 
 def config_for_commands(context: typer.Context, config: Config = None) -> None:

@@ -21,9 +21,7 @@ FALLBACK_TEXTS = {
 
 
 def compare(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="A.MCAP B.MCAP…", help="Recordings; the first one is the reference.")
-    ],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN.MCAP", help="Recordings; the first one is the reference.")],
     align: Annotated[
         str, typer.Option(help="Time zero: motion, start, or a kind of event, such as part_picked.")
     ] = "motion",

@@ -17,7 +17,7 @@ SEVERITIES = ("info", "warning", "error")
 
 def events(
     run: Annotated[
-        Path | None, typer.Argument(metavar="[RUN.MCAP]", help="A recording; without one, the events of a running lab.")
+        Path | None, typer.Argument(metavar="RUN.MCAP", help="A recording; without one, the events of a running lab.")
     ] = None,
     rig: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only this rig; may be repeated.")] = None,
     kind: Annotated[

@@ -8,7 +8,7 @@ import typer
 
 def example(
     name: Annotated[
-        str, typer.Argument(metavar="[NAME]", help="File or folder; without it, all examples are listed.")
+        str, typer.Argument(metavar="NAME", help="File or folder; without it, all examples are listed.")
     ] = "",
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write to.")] = Path(),
 ) -> None:

@@ -30,7 +30,7 @@ LOSS_SYNTAX = "RATE (as bernoulli:RATE), none, bernoulli:RATE or gilbert:TO_BAD,
 
 def impair(
     rigs: Annotated[
-        list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs; default: show all rigs of the lab.")
+        list[str] | None, typer.Argument(metavar="RIG", help="Names of the rigs; default: show all rigs of the lab.")
     ] = None,
     every: AllRigs = False,
     preset: Annotated[

@@ -8,7 +8,7 @@ import typer
 
 def join(
     segments: Annotated[
-        list[Path], typer.Argument(metavar="RUN.MCAP RUN.2.MCAP…", help="All segments of one session, in any order.")
+        list[Path], typer.Argument(metavar="RUN.MCAP", help="All segments of one session, in any order.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write; it must not exist.", show_default=False)],
 ) -> None:

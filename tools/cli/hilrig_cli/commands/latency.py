@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def latency(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings.", show_default=False),
+        typer.Argument(metavar="RUN.MCAP", help="Recordings, or folders of recordings.", show_default=False),
     ],
     plot: Annotated[
         Path | None,

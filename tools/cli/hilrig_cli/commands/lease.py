@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def lease(
     rigs: Annotated[
-        list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs; default: all rigs of the lab.")
+        list[str] | None, typer.Argument(metavar="RIG", help="Names of the rigs; default: all rigs of the lab.")
     ] = None,
     every: AllRigs = False,
     release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def recover(
     files: Annotated[
-        list[Path], typer.Argument(metavar="RUN.MCAP…", help="MCAP files, of hilrig or of other programs.")
+        list[Path], typer.Argument(metavar="RUN.MCAP", help="MCAP files, of hilrig or of other programs.")
     ],
     output: Annotated[
         Path | None,

@@ -10,7 +10,7 @@ import typer
 def replay(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown in one view."),
+        typer.Argument(metavar="RUN.MCAP", help="Recordings; several are shown in one view."),
     ],
     save: Annotated[
         Path | None,

@@ -12,7 +12,7 @@ from hilrig_cli.options import AsJson
 def report(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings.", show_default=False),
+        typer.Argument(metavar="RUN.MCAP", help="Recordings, or folders of recordings.", show_default=False),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
     verify: Annotated[

@@ -13,7 +13,7 @@ from hilrig_cli.options import AsJson
 def verify(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings."),
+        typer.Argument(metavar="RUN.MCAP", help="Recordings, or folders of recordings."),
     ],
     tolerance: Annotated[
         float | None,
