@@ -26,6 +26,8 @@ autodoc_typehints = "description"
 napoleon_google_docstring = True
 
 html_theme = "furo"
+html_static_path = ["style"]
+html_css_files = ["site.css"]
 html_title = f"hilrig {version}"
 html_copy_source = False
 html_show_sphinx = False

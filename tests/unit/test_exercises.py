@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_classroom.check import check_assignment
-from hilrig_cli.examples import example_names
+from hilrig_cli.examples import example_names, listed_names, summary
 from hilrig_replay.analysis.summary import summarize
 from hilrig_replay.grading.grade import Grade
 from hilrig_replay.io.run import open_run
@@ -34,6 +34,10 @@ def graded(exercise: Path, program: Path, folder: Path, seconds: float) -> tuple
     grade = summarize(open_run((recording,)), assignment.task).grade
     assert grade is not None
     return code, grade
+
+
+def test_listing_of_examples_says_what_each_one_is() -> None:
+    assert [name for name in listed_names() if not summary(name)] == []
 
 
 def test_there_are_eight_exercises_with_solutions() -> None:

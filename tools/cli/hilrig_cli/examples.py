@@ -1,6 +1,7 @@
 """Examples: controllers, lab files and exercises, in a checkout or installed with the package."""
 
 import importlib.util
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -10,7 +11,16 @@ from hilrig_runtime.errors import OperationError
 FOLDERS: Final = {"": "examples", "compose": "compose", "exercises": "exercises"}
 """Folder of the examples of each prefix of a name, relative to a checkout."""
 _PACKAGE: Final = "hilrig_examples"
-_COMMENT_MARKS: Final = ("#", "//", "/*", "(*", '"""')
+PROJECTS: Final = {
+    "4diac": "Joint controller for 4diac FORTE: docs/controllers/forte.md",
+    "beremiz": "Project of Beremiz: docs/controllers/beremiz.md",
+    "node-red": "Flows of Node-RED: docs/controllers/node-red.md",
+    "openplc": "Program of OpenPLC with its settings and build script: docs/controllers/openplc.md",
+}
+"""Folders of files that are used together, with their content."""
+_OF_FILES: Final = {"package.json": "Library of hold_position.js, for `npm install`"}
+"""Content of files that can't have a comment."""
+_COMMENT_MARKS: Final = ("#", "//", "/*", "(*", '"""', "%")
 _NOT_EXAMPLES: Final = ("__pycache__", "node_modules")
 
 
@@ -37,6 +47,12 @@ def example_names() -> list[str]:
     return sorted(name for name, _ in _files())
 
 
+def listed_names() -> list[str]:
+    """Return the names of a listing: of a project or an exercise only its folder."""
+    parts = (name.split("/") for name in example_names())
+    return list(dict.fromkeys("/".join(path[: 1 if path[0] in PROJECTS else 2]) for path in parts))
+
+
 def example_path(name: str) -> Path:
     """Return the path of a file or folder of examples by its name, for example `hold_position.py`.
 
@@ -54,10 +70,13 @@ def example_path(name: str) -> Path:
 
 
 def summary(name: str) -> str:
-    """Return the first line of the comment or docstring at the beginning of a file; empty without one, or a folder."""
+    """Return the content in a line: the beginning of a file's comment or docstring, or the title of an exercise."""
+    if known := PROJECTS.get(name) or _OF_FILES.get(name):
+        return known
     path = example_path(name)
     if path.is_dir():
-        return ""
+        assignment = path / "assignment.toml"
+        return str(tomllib.loads(assignment.read_text(encoding="utf-8"))["title"]) if assignment.exists() else ""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[:3]:
         for mark in _COMMENT_MARKS:
             if line.startswith(mark) and not line.startswith("#!"):

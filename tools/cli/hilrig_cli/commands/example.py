@@ -17,7 +17,7 @@ def example(
 
     from rich.table import Table
 
-    from hilrig_cli.examples import example_names, example_path, summary
+    from hilrig_cli.examples import example_path, listed_names, summary
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.errors import InputError, OperationError
 
@@ -25,8 +25,7 @@ def example(
         table = Table(box=None, header_style="bold")
         table.add_column("example", overflow="fold")
         table.add_column("content", ratio=1)
-        # Of a project, such as that of a PLC tool, its folders are listed.
-        for known in dict.fromkeys("/".join(name.split("/")[:2]) for name in example_names()):
+        for known in listed_names():
             table.add_row(known, summary(known))
         TerminalConsole().print(table)
         return
