@@ -5,8 +5,10 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.segment import Segment
+from rich.table import Table
 
 from hilrig_runtime.escaping import printable
 
@@ -22,6 +24,14 @@ class TerminalConsole(Console):
             segment if segment.control else Segment(printable(segment.text, keep="\n"), segment.style)
             for segment in buffer
         )
+
+
+class TerminalTable(Table):
+    """A table as all commands print it: without lines between the columns it fits a terminal of 80 characters."""
+
+    def __init__(self, *headers: str, title: str | None = None, **options: Any) -> None:
+        look = {"title_justify": "left", "title_style": "bold", "box": SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
+        super().__init__(*headers, title=title, **{**look, **options})
 
 
 def has_fixed_width() -> bool:

@@ -20,11 +20,10 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Validate a lab's configuration file and roster: report every error, and print the rigs with their addresses."""
-    from rich.table import Table
 
     from hilrig_cli.json_output.lab import CheckOutput
     from hilrig_cli.json_output.model import print_json
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
     from hilrig_runtime.addresses import format_address
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
@@ -47,7 +46,7 @@ def check(
     is_restricted = any(rig.allow for rig in lab.rigs)
     columns = ("rig", *addresses[lab.rigs[0].name], *(["allowed networks"] if is_restricted else []))
     title = f"{file or 'defaults'}: lab {lab.name!r} is valid"
-    table = Table(*columns, "step", "integrator", title=title, title_justify="left")
+    table = TerminalTable(*columns, "step", "integrator", title=title)
     for rig in lab.rigs:
         substeps = "" if lab.sim.substeps == 1 else f", {describe_substeps(lab.sim.substeps)}"
         allowed = [", ".join(map(str, rig.allow)) or "all"] if is_restricted else []

@@ -80,16 +80,14 @@ def compare(
 def _print(comparison: "Comparison") -> None:
     from math import degrees
 
-    from rich.table import Table
-
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     reference = comparison.summaries[0]
     title = f"Against {reference.session}, aligned by {comparison.aligned_by}"
-    table = Table(title=title, title_justify="left", title_style="bold")
+    table = TerminalTable(title=title)
     table.add_column("")
     for difference in comparison.differences:
-        table.add_column(difference.session, justify="right", overflow="fold")
+        table.add_column(difference.session.replace("Z-", "Z-\n", 1), justify="right", overflow="fold")
     each = comparison.differences
     table.add_row("common time, s", *(f"{one.overlap_s:.2f}" for one in each), end_section=True)
     table.add_row("tool distance, rms, mm", *(f"{one.tool_rms_mm:.3f}" for one in each))

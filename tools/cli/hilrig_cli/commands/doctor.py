@@ -149,13 +149,12 @@ def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[Check
 
 def _print_table(results: "list[CheckResult]") -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     from hilrig_cli.doctor import Level
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     colors = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "bold red"}
-    table = Table()
+    table = TerminalTable()
     for column in ("level", "check", "result"):
         table.add_column(column, no_wrap=column != "result", overflow="fold")
     for result in results:

@@ -21,11 +21,10 @@ def ik(
 
     Exit code 1: the pose cannot be reached.
     """
-    from rich.table import Table
 
     from hilrig_cli.json_output.lab import IkOutput
     from hilrig_cli.json_output.model import print_json
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
     from hilrig_runtime.config.lab import LabConfig, load_lab
     from hilrig_sim.arm.joints import JOINT_SCALE
     from hilrig_sim.arm.kinematics import UnreachableError, inverse
@@ -46,7 +45,7 @@ def ik(
     elif reason:
         print(f"no solution: {reason}")
     else:
-        table = Table("elbow", "θ1, °", "θ2, °", "d3, mm", "θ4, °")
+        table = TerminalTable("elbow", "θ1, °", "θ2, °", "d3, mm", "θ4, °")
         for theta1, theta2, d3, theta4 in solutions:
             side = "straight" if abs(theta2) < 1e-9 else "left" if theta2 < 0 else "right"
             table.add_row(side, *(f"{value:.2f}" for value in (theta1, theta2, d3, theta4)))

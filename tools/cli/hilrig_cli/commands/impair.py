@@ -145,13 +145,11 @@ def _row(status: "ImpairmentStatus") -> dict[str, object]:
 
 
 def _print_table(statuses: "list[ImpairmentStatus]") -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
     from hilrig_runtime.config.impairment import LinkImpairments
 
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = TerminalTable()
     for column in ("rig", "link", "impairment", "messages", "lost", "superseded"):
         numeric = column in ("messages", "lost", "superseded")
         table.add_column(column, justify="right" if numeric else "left", no_wrap=numeric, overflow="fold")

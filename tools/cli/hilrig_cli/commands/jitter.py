@@ -53,16 +53,14 @@ def _measure(step_ms: float, seconds: float, loaded: bool) -> "TimingResult":
 
 
 def _print_table(result: "TimingResult") -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     console = TerminalConsole()
     condition = "with CPU load" if result.loaded else "without load"
     title = f"Step {result.step_ms:g} ms for {result.seconds:g} s, {condition}: {result.ticks} ticks"
-    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = TerminalTable(title=title)
     table.add_column("ms", no_wrap=True)
     for column in COLUMNS:
         table.add_column(column.replace("p999", "p99.9"), justify="right", no_wrap=True)

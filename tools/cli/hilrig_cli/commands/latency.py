@@ -104,19 +104,16 @@ def _task(run: "Run") -> "TaskConfig | None":
 
 def print_report(report: "LatencyReport") -> None:
     """Print the latency report of one run: a table, losses, findings and the verdict."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
     from hilrig_replay.analysis.diagnosis.evidence import sections
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.intervals import cells
 
     console = TerminalConsole()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
-    # Without lines between the columns the table fits a terminal of 80 characters.
-    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = TerminalTable(title=title)
     table.add_column("ms", no_wrap=True)
     for title in STATISTICS_TITLES:
         table.add_column(title, justify="right", no_wrap=True)
@@ -150,16 +147,14 @@ def print_report(report: "LatencyReport") -> None:
 
 def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     """Print a table of runs by name, one line each, their medians, and below it their findings or reasons."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
     from hilrig_replay.analysis.intervals import aggregate, rounded
 
     console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
-    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, show_edge=False)
+    table = TerminalTable(title=title, padding=0, show_edge=False)
     # What the figures leave of 80 characters: the time of a session's name, and its rig in a second line.
     table.add_column("run", overflow="fold", min_width=18)
     for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):

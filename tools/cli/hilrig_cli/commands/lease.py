@@ -65,12 +65,10 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
 
 
 def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = TerminalTable()
     student = ["student"] if any(status.student for status in statuses) else []
     for column in ("rig", *student, "lease holder", "silent", "session", "clients", "watchdog"):
         table.add_column(column, no_wrap=column in ("rig", "watchdog"), overflow="fold")

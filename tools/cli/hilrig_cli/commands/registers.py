@@ -36,16 +36,13 @@ def registers(
 def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
     from itertools import groupby
 
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     console = TerminalConsole()
     keys = ("number", *(["address"] if console.width >= WIDE_TERMINAL_COLUMNS else []), "name", "type", "unit", "scale")
     for name, in_table in groupby(rows, key=lambda row: row["table"]):
         title = f"{str(name).capitalize()}s; the address in a request is the number minus 1"
-        table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        table = TerminalTable(title=title)
         for key in (*keys, "access"):
             table.add_column(key, no_wrap=True, justify="right" if key in ("number", "address", "scale") else "left")
         table.add_column("meaning", overflow="fold")

@@ -28,18 +28,17 @@ Name = Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig.")]
 @app.command(name="list")
 def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     """List the rigs of a running lab with their addresses, simulation and edge, including rigs added at run time."""
-    from rich.table import Table
 
     from hilrig_cli.json_output.lab import RigListOutput
     from hilrig_cli.json_output.model import print_json
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     with _join(config) as (lab, _, found):
         rows = _rows(lab, found)
     if as_json:
         print_json([RigListOutput.model_validate(row) for row in rows])
         return
-    table = Table("rig", "address", "simulation", "edge", "source")
+    table = TerminalTable("rig", "address", "simulation", "edge", "source")
     for row in rows:
         origin = "lab.toml" if row["in_file"] else "added"
         table.add_row(row["rig"], row["address"], row["sim"] or "none", row["edge"] or "none", origin)
@@ -146,12 +145,10 @@ def codes(
     """
     from datetime import datetime
 
-    from rich.table import Table
-
     from hilrig_classroom.slot_codes import codes_csv, issue_codes, parse_end, select_students
     from hilrig_cli.json_output.lab import RigCodesOutput
     from hilrig_cli.json_output.model import print_json
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
     from hilrig_runtime.config.claim_codes import replace_private_file
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError, OperationError
@@ -170,9 +167,7 @@ def codes(
     if as_json:
         print_json(RigCodesOutput(until=ends.isoformat(), codes=made))
         return
-    table = Table(
-        "id", "name", "group", "rig", "code", title=f"codes until {ends:%Y-%m-%d %H:%M}", title_justify="left"
-    )
+    table = TerminalTable("id", "name", "group", "rig", "code", title=f"codes until {ends:%Y-%m-%d %H:%M}")
     for one in students:
         table.add_row(one.id, one.name, one.group, one.rig or "any", made[one.id])
     TerminalConsole().print(table)

@@ -122,16 +122,15 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
 
 
 def _print_results(results: dict[str, Any], out: Path) -> None:
-    from rich.table import Table
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     console = TerminalConsole()
     title = (
         f"{results['title']}: {results['runs']:,} runs, {results['simulated_s']:,.0f} s simulated in "
         f"{results['seconds']:.1f} s ({results['times_real_time']:,.0f} × real time)"
     )
-    table = Table(title=title, title_justify="left", title_style="bold")
+    table = TerminalTable(title=title)
     for column in ("controller", "gain", "stable up to added delay, ms", "delay margin, ms", "jitter margin, ms"):
         table.add_column(column, justify="left" if column == "controller" else "right")
     for controller in results["controllers"]:
@@ -186,10 +185,9 @@ def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Term
 
 
 def _print_gains(evaluation: dict[str, Any]) -> None:
-    from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_cli.terminal import TerminalConsole, TerminalTable
 
     latency, age = evaluation["latency"], evaluation["age_ms"]
     title = (
@@ -197,7 +195,7 @@ def _print_gains(evaluation: dict[str, Any]) -> None:
         f"max {latency['max_ms']:.1f} ms; age p50 {age['p50']:.1f}, p99 {age['p99']:.1f} ms; "
         f"step {evaluation['step_ms']:g} ms"
     )
-    table = Table(title=title, title_justify="left", title_style="bold")
+    table = TerminalTable(title=title)
     for column in ("controller", "gain", "stable", "mean-square growth", "expected cost", "delay margin, ms"):
         table.add_column(column, justify="left" if column == "controller" else "right")
     for gain in evaluation["gains"]:

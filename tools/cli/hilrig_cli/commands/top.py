@@ -149,8 +149,7 @@ def _table(
 
     Rows whose first cell is in `red` are highlighted.
     """
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
+    from hilrig_cli.terminal import TerminalTable
 
     needed = {name: max([len(name), *(len(row[name]) for row in rows)]) + 2 for name in columns}
     shown = list(columns)
@@ -159,7 +158,7 @@ def _table(
         if not columns[dropped]:
             break
         shown.remove(dropped)
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = TerminalTable()
     for name in shown:
         table.add_column(name, justify="left" if name in LEFT_ALIGNED_COLUMNS else "right", no_wrap=True)
     for row in rows:
