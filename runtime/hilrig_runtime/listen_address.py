@@ -28,7 +28,9 @@ class ListenAddress:
         """
         host, colon, port = text.rpartition(":")
         if not colon or not port.isascii() or not port.isdigit() or int(port) > 65535:
-            raise InputError(f"--listen {text!r}: expected HOST:PORT, for example 127.0.0.1:8050")
+            raise InputError(
+                f"--listen {text!r}: expected HOST:PORT with a port of 0 to 65535, for example 127.0.0.1:8050"
+            )
         return cls(host.removeprefix("[").removesuffix("]") or "0.0.0.0", int(port))
 
     @property

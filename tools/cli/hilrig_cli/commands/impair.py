@@ -1,6 +1,7 @@
 """`hilrig impair`: network impairment emulation (delay, loss) in the loop of a running rig."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -108,8 +109,10 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
 
         with isolated(trace):
             delays["command"] = delay_trace(open_run(find_run(trace)))
-    if loss and loss.replace(".", "", 1).isdigit():
-        loss = f"bernoulli:{loss}"
+    if loss:
+        with suppress(ValueError):
+            float(loss)
+            loss = f"bernoulli:{loss}"
     losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
     links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
     try:
