@@ -145,8 +145,8 @@ def force_exit_after(stopping: threading.Event, timeout_s: float) -> None:
 def run_process(main: Callable[[], int | None]) -> NoReturn:
     """Run a command in this process as `run_main`, and end the process with its exit code.
 
-    The interpreter does what it does at its end, but is not ended itself: that would end the threads of the bus in the
-    middle of a callback, which aborts the process.
+    Threads, functions of `atexit` and output are completed as by the interpreter, which is not ended itself: that would
+    end the threads of the bus in the middle of a callback, and abort the process.
     """
     code: int | str | None = 1
     try:
