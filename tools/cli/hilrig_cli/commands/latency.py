@@ -155,7 +155,7 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
     table = TerminalTable(title=title, padding=0, show_edge=False)
-    # What the figures leave of 80 characters: the time of a session's name, and its rig in a second line.
+    # The figures leave 18 of 80 characters: the time of a session, and its rig in a second line.
     table.add_column("run", overflow="fold", min_width=18)
     for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):
         table.add_column(column, justify="right", no_wrap=True)
