@@ -25,12 +25,15 @@ _EXECUTE_CHILD = inspect.signature(subprocess.Popen._execute_child)  # type: ign
 SERVERS: list[socket.socket] = []
 """Requests of the server of this process, which is started at the first use. It ends when the socket is closed."""
 
+_STARTED: list["subprocess.Popen[bytes]"] = []
+"""The started server: without a reference, its running process would be reported as a leak."""
+
 
 def _start_server() -> None:
     requests, replies = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     program = Path(__file__).with_name("fork_server.py")
     path = os.pathsep.join([str(program.parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, str(program), str(replies.fileno()), " " * ARGUMENT_BYTES],
         stdin=subprocess.DEVNULL,
         pass_fds=[replies.fileno()],
@@ -38,6 +41,7 @@ def _start_server() -> None:
     )
     replies.close()
     SERVERS.append(requests)
+    _STARTED.append(process)
 
 
 class ForkedPopen(subprocess.Popen[Any]):
