@@ -104,6 +104,12 @@ class Evidence:
         """Mean age; 0: none."""
         return 0.0 if self.age is None else self.age.age_ms.mean * MS
 
+    @property
+    def hidden_age_ns(self) -> float:
+        """Mean age that the timestamps do not show, of torques that act on an earlier poll."""
+        behind = self.gains.polls_behind
+        return float(self.gains.older_steps[behind]) * self.step_ns if behind else 0.0
+
     def cycles(self) -> Rows:
         """Cycles of the controller in the windows, fields as `CYCLE_DTYPE`."""
         found = [_cycles(window.commands) for window in self.windows]
