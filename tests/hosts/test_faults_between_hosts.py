@@ -52,6 +52,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MultiHostLab]:
         yield made
 
 
+UNBATCHED_NS = 1_000_000_000
+"""Last messages of a killed simulation that it had not sent to the recorder, or that the recorder had not written."""
+FETCH_S = 1.0
+"""Time in which a recorder that is ready fetches the messages of its outage; on a loaded machine of two processors."""
 LOST = {"edge": "no states since ", "sim": "no command received for ", "recorder": "no messages of "}
 """Begin of the text of an outage, in the recording and in the log of each service."""
 
@@ -171,6 +175,41 @@ def test_recorder_failure_does_not_affect_the_loop(lab: MultiHostLab) -> None:
     assert len(after) > 50
     assert (np.abs(after["effort"]).max(axis=1) > 0).all(), "the torque was interrupted during the recorder outage"
     assert np.diff(states["step"].astype(np.int64)).max() == 1, "messages of the outage are missing"
+
+
+RECORDER_OUTAGE_S = 3.7
+
+
+@pytest.mark.long("takes 30 s")
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("is_fetched", [True, False])
+def test_simulation_killed_after_a_recorder_failure(lab: MultiHostLab, is_fetched: bool) -> None:
+    with ControllerSession(lab) as session:
+        recorder_killed_ns = lab.kill("recorder")
+        time.sleep(RECORDER_OUTAGE_S)  # the duration of the outage
+        if is_fetched:
+            ready = lab.log("recorder").read_text().count("ready:")
+            lab.start("recorder")
+            eventually(lambda: lab.log("recorder").read_text().count("ready:") > ready, every_s=0.02)
+            time.sleep(FETCH_S)  # the recorder fetches the messages of the outage
+        killed_ns = lab.kill("sim")
+        if not is_fetched:
+            lab.start("recorder")
+        eventually(lambda: not lab.receives_states(), timeout_s=5, every_s=0.1)
+        lab.start("sim")
+        lab.wait_for_closed_loop(20)
+    states = session.states()
+    before = states[states["incarnation"] == states["incarnation"][0]]
+    assert np.diff(before["step"].astype(np.int64)).max() == 1
+    silent_ns = killed_ns - int(before["sampled_ns"][-1])
+    if is_fetched:
+        assert silent_ns < UNBATCHED_NS, "messages of the outage are missing"
+        assert session.reported_lost() == 0
+    else:
+        outage_ns = killed_ns - recorder_killed_ns
+        assert outage_ns <= silent_ns <= outage_ns + UNBATCHED_NS
+        lost = silent_ns / 1e9 / STEP_S
+        assert lost - 1 <= session.reported_lost() <= lost + UNBATCHED_NS / 1e9 / STEP_S
 
 
 @pytest.mark.long("takes 15 s")

@@ -55,4 +55,4 @@ if __name__ == "__main__":
     if serve():
         from hilrig_cli.__main__ import main
 
-        sys.exit(main())
+        main()
