@@ -74,7 +74,8 @@ def follows_positions(windows: Iterable[tuple[Rows, Rows]]) -> bool:
 
 def _series(states: Rows, commands: Rows) -> Iterator[Series]:
     """The first command after each poll, with the positions of its basis, by incarnation of the simulation."""
-    commands = commands[(commands["basis_step"] > 0) & ~commands["safe"]]
+    based, safe = commands["basis_step"] > 0, commands["safe"]
+    commands = commands[based & ~safe]
     for incarnation in np.unique(states["incarnation"]):
         known = states[states["incarnation"] == incarnation]
         chosen = commands[commands["basis_incarnation"] == incarnation]

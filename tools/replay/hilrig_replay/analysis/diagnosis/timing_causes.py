@@ -414,8 +414,9 @@ def beating(evidence: Evidence) -> Finding | None:
     late = count = 0
     for rows in evidence.samples.blocks("loop", REGISTER_WAIT.key, TICK_WAIT.key):
         # Steps that the loop takes without waiting for the next poll and the next tick.
-        needed = np.ceil((rows["loop"] - rows[REGISTER_WAIT.key] - rows[TICK_WAIT.key]) / step_ns)
-        late += int((np.rint(rows["loop"] / step_ns) > np.maximum(needed, 1)).sum())
+        loop_ns, register_ns, tick_ns = rows["loop"], rows[REGISTER_WAIT.key], rows[TICK_WAIT.key]
+        needed = np.ceil((loop_ns - register_ns - tick_ns) / step_ns)
+        late += int((np.rint(loop_ns / step_ns) > np.maximum(needed, 1)).sum())
         count += len(rows)
     if not late:
         return None
