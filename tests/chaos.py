@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,8 @@ CACHED_S = 25.0
 """An outage of at most this time loses nothing (the caches have 30 s)."""
 LOST_BEFORE_KILL_NS = 1_000_000_000
 """Last messages of a killed simulation that it had not added to its recording stream."""
+FETCHED_NS = 3_000_000_000
+"""Time from the restart of a recorder in which it has fetched the messages of its outage (docs/several-hosts.md)."""
 RECOVERY_S = 60.0
 SEEN = np.dtype([("rig", "u1"), ("incarnation", "u8"), ("step", "u8"), ("flags", "u1"), ("sampled_ns", "i8")])
 IN_SESSION, HAS_TORQUE = 1, 2
@@ -250,7 +253,8 @@ def check_torque(faults: list[Fault], recorded: Recorded) -> Iterator[str]:
             times = states["sampled_ns"]
             during = states[(times > fault.begin_ns + limit_ns) & (times < fault.end_ns)]
             if during["torque"].any():
-                late_ns = times[(times < fault.end_ns) & states["torque"]].max() - fault.begin_ns
+                torque = states["torque"]
+                late_ns = times[(times < fault.end_ns) & torque].max() - fault.begin_ns
                 yield f"{fault}: rig {rig + 1} has torque {late_ns / 1e6:.0f} ms after it, limit {limit_ns / 1e6:.0f}"
 
 
@@ -259,11 +263,23 @@ def check_losses(faults: list[Fault], recorded: Recorded, seen: np.ndarray) -> I
     lost = []
     for rig, states in recorded.states.items():
         known = set(zip(states["incarnation"].tolist(), states["step"].tolist(), strict=True))
-        own = seen[(seen["rig"] == rig) & (seen["flags"] & IN_SESSION > 0)]
+        rigs, flags = seen["rig"], seen["flags"]
+        own = seen[(rigs == rig) & (flags & IN_SESSION > 0)]
         keys = zip(own["incarnation"].tolist(), own["step"].tolist(), strict=True)
         lost += [int(ns) for key, ns in zip(keys, own["sampled_ns"], strict=True) if key not in known]
     remaining = np.array(sorted(lost), np.int64)
     witnessed = int((seen["flags"] & IN_SESSION > 0).sum())
+    excused = sum(fault.kind == "kill" and fault.host == "sim" for fault in faults) * RIGS * 50
+    for outage, fault in pairwise(faults):
+        # The messages of an outage of the recorder are in the cache of the killed service only.
+        if (outage.kind, outage.host) != ("kill", "recorder") or fault.kind != "kill" or fault.host == "router":
+            continue
+        if fault.begin_ns - outage.end_ns < FETCHED_NS:
+            within = (remaining > outage.begin_ns - LOST_BEFORE_KILL_NS) & (remaining <= fault.begin_ns)
+            print(f"{outage}, {fault}: {int(within.sum())} of the witnessed messages lost", flush=True)
+            # The file of a killed simulation states them, that of a killed edge ends with the recorder.
+            excused += int(within.sum()) if fault.host == "edge" else 0
+            remaining = remaining[~within]
     for fault in faults:
         near = (remaining > fault.begin_ns - LOST_BEFORE_KILL_NS) & (remaining < fault.end_ns + 10 * 10**9)
         count = int(near.sum())
@@ -277,7 +293,6 @@ def check_losses(faults: list[Fault], recorded: Recorded, seen: np.ndarray) -> I
     print(f"{len(lost)} of {witnessed} witnessed messages lost; {recorded.stated} losses stated in the files")
     if len(remaining):
         yield f"{len(remaining)} messages lost that no fault explains, at {remaining[:5].tolist()}"
-    excused = sum(fault.kind == "kill" and fault.host == "sim" for fault in faults) * RIGS * 50
     if len(lost) > recorded.stated + excused:
         yield f"{len(lost)} messages lost, but only {recorded.stated} stated"
 

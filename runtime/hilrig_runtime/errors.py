@@ -6,7 +6,11 @@ top of the process (`process.shutdown.run_main`).
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+MAX_ERROR_LINES: Final = 20
+"""Number of mistakes of one kind that a message lists; the others are counted."""
 
 
 class HilrigError(Exception):
@@ -29,6 +33,14 @@ def list_names(names: Sequence[str], limit: int = 3) -> str:
     """Join names for a message; those beyond `limit` are only counted."""
     more = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {more} more" if more > 0 else "")
+
+
+def first_errors(
+    errors: Sequence[Any], describe: Callable[[Any], str] = str, limit: int = MAX_ERROR_LINES
+) -> list[str]:
+    """Return the texts of the first `limit` errors, and one with the number of the others."""
+    more = len(errors) - limit
+    return [*map(describe, errors[:limit]), *([f"{more} more errors"] if more > 0 else [])]
 
 
 def install_command(extra: str) -> str:

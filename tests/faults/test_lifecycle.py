@@ -16,7 +16,7 @@ SERVICE = """
 import sys, threading, time
 from hilrig_runtime.config.lab import BusConfig, LabConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.process.shutdown import run_main
+from hilrig_runtime.process.shutdown import run_process
 from hilrig_runtime.process.lifecycle import run_service
 
 def orderly(service):
@@ -44,7 +44,7 @@ def main():
     run_service("sim", {run}, lab, stop_with_parent={parent}, close_timeout_s={timeout})
     print("ended", flush=True)
 
-sys.exit(run_main(main))
+run_process(main)
 """
 
 
@@ -138,6 +138,41 @@ def test_error_is_one_line_with_its_exit_code(tmp_path: Path) -> None:
     assert "hilrig: error: lab.toml: sim.step: unknown key\n" in errors
     assert "Traceback" not in errors
     assert process.returncode == 2
+
+
+ENDING_PROGRAM = """
+import atexit, sys, threading
+from hilrig_runtime.process.shutdown import run_process
+
+def main():
+    atexit.register(print, "last function")
+    threading.Thread(target=lambda: threading.Event().wait(0.2) or print("thread")).start()
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+    print("main")
+    {ending}
+
+run_process(main)
+"""
+
+
+@pytest.mark.parametrize(
+    ("ending", "code", "error"),
+    [
+        ("return None", 0, ""),
+        ("return 3", 3, ""),
+        ("sys.exit()", 0, ""),
+        ("sys.exit(4)", 4, ""),
+        ("sys.exit('text')", 1, "text"),
+        ("return 1 // 0", 1, "ZeroDivisionError"),
+    ],
+)
+def test_process_ends_as_the_interpreter(ending: str, code: int, error: str) -> None:
+    command = [sys.executable, "-c", ENDING_PROGRAM.format(ending=ending)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LONG_TIMEOUT_S)
+    assert done.stdout == "main\nthread\nlast function\n"
+    assert error in done.stderr
+    assert bool(error) == bool(done.stderr)
+    assert done.returncode == code
 
 
 HANGUP_PROGRAM = """

@@ -111,7 +111,7 @@ import sys
 import hilrig_runtime.process.service as service
 service.batch_cache_depth = lambda *_: {SHORT_CACHE}
 from hilrig_cli.__main__ import main
-sys.exit(main())
+main()
 """
 
 

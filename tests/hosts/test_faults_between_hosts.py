@@ -52,6 +52,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MultiHostLab]:
         yield made
 
 
+UNBATCHED_NS = 1_000_000_000
+"""Last messages of a killed simulation that it had not sent to the recorder, or that the recorder had not written."""
+FETCH_S = 1.0
+"""Time in which a recorder that is ready fetches the messages of its outage; on a loaded machine of two processors."""
 LOST = {"edge": "no states since ", "sim": "no command received for ", "recorder": "no messages of "}
 """Begin of the text of an outage, in the recording and in the log of each service."""
 
@@ -75,7 +79,8 @@ def test_loop_recovers_after_router_restart(lab: MultiHostLab) -> None:
         )
     states = session.states()
     assert time_to_zero_ns(states, killed_ns) <= TIMEOUT_NS + TOLERANCE_NS
-    assert np.abs(states["effort"][states["sampled_ns"] > back_ns]).max() > 0, "no torque after the recovery"
+    recovered = states[states["sampled_ns"] > back_ns]
+    assert np.abs(recovered["effort"]).max() > 0, "no torque after the recovery"
     steps = np.diff(states["step"].astype(np.int64))
     assert steps.max() == 1, "states of the outage are missing: the simulation must send them again"
     [lost], [_] = session.event_texts("STATE_LOST"), session.event_texts("STATE_BACK")
@@ -115,7 +120,8 @@ def test_loop_recovers_after_simulation_link_cut(lab: MultiHostLab, cut_s: float
         lab.wait_for_closed_loop(30)
         back_ns = time.monotonic_ns()
     states = session.states()
-    assert np.abs(states["effort"][states["sampled_ns"] > back_ns]).max() > 0
+    recovered = states[states["sampled_ns"] > back_ns]
+    assert np.abs(recovered["effort"]).max() > 0
     alone = states[(states["sampled_ns"] > cut_ns + TIMEOUT_NS + TOLERANCE_NS) & (states["sampled_ns"] < linked_ns)]
     if cut_s > 1:
         assert len(alone) > 100
@@ -139,7 +145,8 @@ def test_controllers_detect_simulation_host_failure(lab: MultiHostLab) -> None:
         lab.wait_for_closed_loop(20)
     states = session.states()
     assert len(np.unique(states["incarnation"])) == 2
-    newest = states[(states["incarnation"] == states["incarnation"][-1]) & (states["sampled_ns"] < session.end_ns)]
+    incarnation, sampled_ns = states["incarnation"], states["sampled_ns"]
+    newest = states[(incarnation == incarnation[-1]) & (sampled_ns < session.end_ns)]
     assert np.abs(newest["effort"]).max() > 0, "no torque in the restarted simulation"
     assert session.answered > 50
 
@@ -153,9 +160,8 @@ def test_edge_failure_zeroes_torque(lab: MultiHostLab) -> None:
         time.sleep(1.0)  # the recording shall have torques after the recovery
     states = session.states()
     assert time_to_zero_ns(states, killed_ns) <= TIMEOUT_NS + TOLERANCE_NS
-    assert np.abs(states["effort"][states["sampled_ns"] > killed_ns + 2 * TIMEOUT_NS]).max() > 0, (
-        "the controller did not reconnect"
-    )
+    recovered = states[states["sampled_ns"] > killed_ns + 2 * TIMEOUT_NS]
+    assert np.abs(recovered["effort"]).max() > 0, "the controller did not reconnect"
 
 
 def test_recorder_failure_does_not_affect_the_loop(lab: MultiHostLab) -> None:
@@ -169,6 +175,41 @@ def test_recorder_failure_does_not_affect_the_loop(lab: MultiHostLab) -> None:
     assert len(after) > 50
     assert (np.abs(after["effort"]).max(axis=1) > 0).all(), "the torque was interrupted during the recorder outage"
     assert np.diff(states["step"].astype(np.int64)).max() == 1, "messages of the outage are missing"
+
+
+RECORDER_OUTAGE_S = 3.7
+
+
+@pytest.mark.long("takes 30 s")
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("is_fetched", [True, False])
+def test_simulation_killed_after_a_recorder_failure(lab: MultiHostLab, is_fetched: bool) -> None:
+    with ControllerSession(lab) as session:
+        recorder_killed_ns = lab.kill("recorder")
+        time.sleep(RECORDER_OUTAGE_S)  # the duration of the outage
+        if is_fetched:
+            ready = lab.log("recorder").read_text().count("ready:")
+            lab.start("recorder")
+            eventually(lambda: lab.log("recorder").read_text().count("ready:") > ready, every_s=0.02)
+            time.sleep(FETCH_S)  # the recorder fetches the messages of the outage
+        killed_ns = lab.kill("sim")
+        if not is_fetched:
+            lab.start("recorder")
+        eventually(lambda: not lab.receives_states(), timeout_s=5, every_s=0.1)
+        lab.start("sim")
+        lab.wait_for_closed_loop(20)
+    states = session.states()
+    before = states[states["incarnation"] == states["incarnation"][0]]
+    assert np.diff(before["step"].astype(np.int64)).max() == 1
+    silent_ns = killed_ns - int(before["sampled_ns"][-1])
+    if is_fetched:
+        assert silent_ns < UNBATCHED_NS, "messages of the outage are missing"
+        assert session.reported_lost() == 0
+    else:
+        outage_ns = killed_ns - recorder_killed_ns
+        assert outage_ns <= silent_ns <= outage_ns + UNBATCHED_NS
+        lost = silent_ns / 1e9 / STEP_S
+        assert lost - 1 <= session.reported_lost() <= lost + UNBATCHED_NS / 1e9 / STEP_S
 
 
 @pytest.mark.long("takes 15 s")

@@ -101,7 +101,7 @@ def test_demo_that_can_not_write_its_results(tmp_path: Path) -> None:
 
 def without(package: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run a command without a package, as on a host where only some parts of hilrig are installed."""
-    code = f"import sys; sys.modules['{package}'] = None; from hilrig_cli.__main__ import main; sys.exit(main())"
+    code = f"import sys; sys.modules['{package}'] = None; from hilrig_cli.__main__ import main; main()"
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
 

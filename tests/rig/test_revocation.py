@@ -115,3 +115,11 @@ def test_revocation_that_has_no_effect_fails(tmp_path: Path, table: str, message
     code, text = revoke(config, "alice")
     assert code != 0
     assert message in text
+
+
+@pytest.mark.parametrize("name", ["", "*", "../alice"])
+def test_revocation_of_an_invalid_name_is_refused(tmp_path: Path, name: str) -> None:
+    config = write_lab(tmp_path)
+    config.write_text(config.read_text() + "[edge.tls]\ncertificate = 'e'\nkey = 'e'\nauthority = 'e'\nclients = {}\n")
+    code, text = revoke(config, name)
+    assert (code, f"{name!r} must be the common name" in text) == (2, True), text

@@ -107,7 +107,7 @@ def run(request: dict[str, Any]) -> NoReturn:
 
         hilrig_process.SERVERS.append(fork_own_server())
         subprocess.Popen = hilrig_process.ForkedPopen  # type: ignore[misc]
-    sys.exit(main())
+    main()
 
 
 if __name__ == "__main__":

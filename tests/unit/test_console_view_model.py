@@ -260,3 +260,4 @@ def test_service_is_removed_after_timeout() -> None:
     assert len(view.services()) == 2
     view.update(Health(service="edge", instance="new"), REMOVED_AFTER_S + 1)
     assert [service.name for service in view.services()] == ["edge/new"]
+    assert [service.reports for service in view.services()] == [2]

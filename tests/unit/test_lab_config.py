@@ -157,6 +157,15 @@ def test_binary_file_is_reported_in_one_line(tmp_path: Path) -> None:
         load_lab(tmp_path / "lab.toml")
 
 
+def test_many_errors_are_counted() -> None:
+    with pytest.raises(InputError) as raised:
+        parse_lab("".join(f"key{number} = 1\n" for number in range(60_000)))
+    lines = str(raised.value).splitlines()
+    assert len(lines) == 21
+    assert "key0: unknown key" in lines[0]
+    assert lines[-1].endswith("59980 more errors")
+
+
 def test_unknown_rig_error_lists_existing_rigs() -> None:
     with pytest.raises(InputError, match="unknown rig 'rig9'; this lab has rig1"):
         LabConfig().rig("rig9")

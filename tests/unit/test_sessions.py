@@ -540,6 +540,49 @@ def test_gap_between_segments_is_counted_once(opened_before_the_gap: bool) -> No
     assert (counters.lost_transport, counters.lost_recorder) == (3, 0)
 
 
+@pytest.mark.parametrize("stopped", [None, 3 * SECOND, -30 * SECOND])
+def test_loss_of_a_restarted_simulation_is_estimated(stopped: int | None) -> None:
+    bench = TrackerBench()
+    begin = bench.wall
+    bench.store.seen = {(1, 101 + number, begin - (99 - number) * 20 * MS) for number in range(100)}
+    bench.store.last = {1: (200, begin)}
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    bench.wait(5 * SECOND)
+    if stopped is not None:
+        event = Event(rig="rig1", kind=Event.STATE_LOST, wall_ns=begin + stopped + SECOND)
+        event.watchdog_data.silent_ns = SECOND
+        bench.edge.put(EVENT, "rig1", event, bench.wall)
+        bench.accept(bench.edge.batch())
+    bench.states(1)
+    bench.tracker.flush()
+    expected = 150 if stopped == 3 * SECOND else 250
+    lost = bench.file.recording.counters.lost_recorder
+    assert lost == pytest.approx(expected, abs=1)
+    bench.wait(SECOND)
+    assert bench.store.losses == [(STATE.key(LAB, "rig1"), 0, lost)]
+
+
+def test_recorded_messages_that_are_not_fetched_are_not_lost() -> None:
+    bench = TrackerBench()
+    known = [bench.sim.state("rig1", bench.wall + number) for number in range(100)]
+    bench.store.seen = {(1, message.sequence, message.publish_ns) for message in known}
+    bench.store.last = {1: (100, known[-1].publish_ns)}
+    bench.sim.batch()
+    bench.sim.sent.clear()
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    # The simulation was killed while its cache was fetched: 40 messages, then the ones that were received live.
+    fetched = FakeSource("sim/1")
+    for number in range(40):
+        fetched.state("rig1", bench.wall + number)
+    bench.accept(fetched.batch())
+    fetched._sequences[STATE.key(LAB, "rig1")] = 150
+    fetched.state("rig1", bench.wall + 150)
+    bench.accept(fetched.batch())
+    assert len(bench.file.payloads) == 1
+    counters = bench.file.recording.counters
+    assert (counters.lost_transport, counters.lost_recorder) == (50, 0)
+
+
 def test_messages_before_the_horizon_are_skipped() -> None:
     bench = TrackerBench()
     bench.store.seen = set()

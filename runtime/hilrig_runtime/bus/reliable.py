@@ -149,6 +149,12 @@ class ReliableSubscriber(Handle):
             samples: ReorderBuffer[zenoh.Sample] = ReorderBuffer(
                 self._deliver, partial(logger.debug, "%s: %d samples lost", cache), self._cache_depth
             )
+            for other in self._sources.values():
+                if _service_of(other.cache) == _service_of(cache) and _session_of(other.cache) != _session_of(cache):
+                    # The service was restarted: the cache of its earlier instance has ended with it, and the messages
+                    # that were received of that one precede those of this one.
+                    other.samples.flush()
+                    other.is_new = other.has_backlog = False
             source = self._sources[cache] = _Source(cache, samples)
         return source
 
@@ -234,6 +240,16 @@ def _query_parameters(source: _Source) -> str:
         return "_max=1"
     numbers = source.samples.missing(max(1, FETCH_PAGE_BYTES // source.size))
     return f"_max={len(numbers)};_sn={numbers.start}..{numbers.stop - 1}"
+
+
+def _service_of(cache: str) -> str:
+    """Return the key on which the publisher of a cache publishes."""
+    return cache.partition("/@adv/")[0]
+
+
+def _session_of(cache: str) -> str:
+    """Return the identity of the zenoh session of a cache's publisher."""
+    return cache.rsplit("/", 3)[1]
 
 
 def _cache_of(sample: zenoh.Sample) -> str:

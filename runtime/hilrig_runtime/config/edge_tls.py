@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Final, Literal
 
 from hilrig_runtime.config.types import Port, Section
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import InputError, OperationError
 
 ALL_RIGS: Final = "*"
+_COMMON_NAME_RULE: Final = (
+    "must be the common name of a certificate, without CN=: 1 to 64 letters, digits, blanks and . _ @ -"
+)
 _COMMON_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._@-]{0,62}[A-Za-z0-9])?")
 
 
@@ -41,8 +44,11 @@ class TlsConfig(Section):
         """Check that a client may no longer write; `where` is the name of the file in messages.
 
         Raises:
+            InputError: it is not a name of a certificate.
             OperationError: `clients` lists it, or is missing.
         """
+        if not _COMMON_NAME.fullmatch(name):
+            raise InputError(f"{name!r} {_COMMON_NAME_RULE}")
         if self.clients is None:
             raise OperationError(
                 f"{where} has no [edge.tls.clients], so every certificate may write by its role: add the table with "
@@ -58,10 +64,7 @@ class TlsConfig(Section):
         for name, its_rigs in clients.items():
             place = f"edge.tls.clients.{name}"
             if not _COMMON_NAME.fullmatch(name):
-                yield (
-                    f"{place}: must be the common name of a certificate, without CN=: 1 to 64 letters, digits, blanks "
-                    "and . _ @ -"
-                )
+                yield (f"{place}: {_COMMON_NAME_RULE}")
             if spellings[name.lower()] > 1:
                 yield f"{place}: duplicate name; it differs from another one only in upper and lower case"
             if not its_rigs:

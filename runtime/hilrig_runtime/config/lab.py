@@ -33,7 +33,7 @@ from hilrig_runtime.config.types import (
     check_distinct,
 )
 from hilrig_runtime.config.validation import format_validation_error, parse_toml, read_text, validate
-from hilrig_runtime.errors import InputError, list_names
+from hilrig_runtime.errors import InputError, first_errors, list_names
 from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
 
 MAX_RIGS = 10_000
@@ -338,7 +338,7 @@ class LabConfig(Section):
         if self.edge.tls is not None:
             mistakes += self.edge.tls.mistakes_in_clients(names)
         if mistakes:
-            raise ValueError("\n".join(mistakes))
+            raise ValueError("\n".join(first_errors(mistakes)))
         return self
 
     @property

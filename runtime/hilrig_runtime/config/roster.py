@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from hilrig_runtime.config.validation import read_text
-from hilrig_runtime.errors import InputError, list_names
+from hilrig_runtime.errors import InputError, first_errors, list_names
 from hilrig_schemas.topics import NAME_PATTERN
 
 _ID: Final = re.compile(NAME_PATTERN)
@@ -71,15 +71,14 @@ def read_roster(path: Path) -> Roster:
     header, rows = read_table(path)
     names = [name.strip().lower() for name in header]
     columns = {name: at for at, name in enumerate(names)}
-    errors = [f"{path}: line 1: column {name!r} occurs twice" for name in COLUMNS if names.count(name) > 1]
+    errors = [f"line 1: column {name!r} occurs twice" for name in COLUMNS if names.count(name) > 1]
     missing = [name for name in ("id", "name") if name not in columns]
     if missing:
         errors.append(
-            f"{path}: line 1: column {missing[0]!r} is missing; found {', '.join(header) or 'nothing'}; "
+            f"line 1: column {missing[0]!r} is missing; found {list_names(header, 20) or 'nothing'}; "
             f"expected {', '.join(COLUMNS)}"
         )
-    if errors:
-        raise InputError("\n".join(errors))
+    _raise(path, errors)
     students: dict[str, Student] = {}
     for line, row in rows:
         values = {name: _clean(row[at]) if at < len(row) else "" for name, at in columns.items()}
@@ -87,17 +86,17 @@ def read_roster(path: Path) -> Roster:
         surplus = [cell for cell in row[len(header) :] if cell.strip()]
         if surplus:
             errors.append(
-                f"{path}: line {line}: {len(row)} cells, the header has {len(header)}: put quotation marks around a "
+                f"line {line}: {len(row)} cells, the header has {len(header)}: put quotation marks around a "
                 "cell that contains the separator"
             )
         elif problem := _problem(student, students):
-            errors.append(f"{path}: line {line}: {problem}")
+            errors.append(f"line {line}: {problem}")
         else:
             students[student.id.lower()] = student
     if len(students) > MAX_STUDENTS:
-        errors.append(f"{path}: {len(students)} students, at most {MAX_STUDENTS} are accepted")
+        errors.append(f"{len(students)} students, at most {MAX_STUDENTS} are accepted")
     if not students and not errors:
-        errors.append(f"{path}: no students below the header")
+        errors.append("no students below the header")
     _raise(path, errors)
     return Roster(tuple(students.values()))
 
@@ -117,7 +116,7 @@ def check_rigs(path: Path, roster: Roster, rigs: Collection[str], *, claimed: bo
     mistakes = list(_unknown_rigs(roster, rigs))
     if not claimed:
         mistakes += _shared_rigs(roster.by_rig())
-    _raise(path, [f"{path}: line {line}: {text}" for line, text in sorted(mistakes)])
+    _raise(path, [f"line {line}: {text}" for line, text in sorted(mistakes)])
 
 
 def _unknown_rigs(roster: Roster, rigs: Collection[str]) -> Iterator[tuple[int, str]]:
@@ -195,5 +194,4 @@ def _problem(student: Student, known: Mapping[str, Student]) -> str:
 def _raise(path: Path, errors: list[str]) -> None:
     """Raise an error with the mistakes, if there are any."""
     if errors:
-        more = len(errors) - _MAX_ERRORS
-        raise InputError("\n".join(errors[:_MAX_ERRORS] + ([f"{path}: {more} more errors"] if more > 0 else [])))
+        raise InputError("\n".join(f"{path}: {line}" for line in first_errors(errors, limit=_MAX_ERRORS)))

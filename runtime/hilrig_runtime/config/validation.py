@@ -3,14 +3,16 @@
 import difflib
 import reprlib
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_args
 
 from pydantic import ValidationError
 
 from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS, Section, TableForm
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import InputError, first_errors
 
 SectionT = TypeVar("SectionT", bound=Section)
 
@@ -91,7 +93,7 @@ def validate(model: type[SectionT], values: dict[str, Any], where: str = "") -> 
     """Return the table with these values; `where` is the name of the file in messages.
 
     Raises:
-        InputError: a value is invalid; names every error.
+        InputError: a value is invalid; lists the first errors.
     """
     try:
         return model.model_validate(values)
@@ -103,18 +105,18 @@ def validate(model: type[SectionT], values: dict[str, Any], where: str = "") -> 
 
 
 def format_validation_error(error: ValidationError) -> list[str]:
-    """Return one sentence for each invalid value, with its place."""
-    return [_sentence(detail) for detail in _causes(error)]
+    """Return one sentence for each of the first invalid values, with its place, and the number of the others."""
+    return first_errors(_causes(error), _sentence)
 
 
 def _causes(error: ValidationError) -> list[Any]:
     """Return the details of all errors, except of a list that is too short only because an item of it is invalid."""
     details = list(_flatten(error, ()))
 
+    places = Counter(detail["loc"][:end] for detail in details for end in range(len(detail["loc"]) + 1))
+
     def is_consequence(detail: Any) -> bool:
-        place = detail["loc"]
-        others = (other["loc"] for other in details if other is not detail)
-        return detail["type"] == "too_short" and any(loc[: len(place)] == place for loc in others)
+        return detail["type"] == "too_short" and places[detail["loc"]] > 1
 
     return [detail for detail in details if not is_consequence(detail)]
 
@@ -128,7 +130,7 @@ def _flatten(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[A
             yield from _flatten(cause, here["loc"])
         else:
             if detail["type"] == "extra_forbidden":
-                here["keys"] = _known_keys(error.title, detail["loc"][:-1])
+                here["keys"] = partial(_known_keys, error.title, detail["loc"][:-1])
             yield here
 
 
@@ -173,7 +175,7 @@ def _text(detail: Any) -> str:
     got = _REPR.repr(detail["input"])
     match kind:
         case "extra_forbidden":
-            return _unknown_key(str(detail["loc"][-1]), detail["keys"])
+            return _unknown_key(str(detail["loc"][-1]), detail["keys"]())
         case "missing":
             return "is missing"
         case "value_error":

@@ -6,6 +6,7 @@ configuration again, and ends it only if its terminal was closed. Every command 
 module, so it imports nothing that is slow to import.
 """
 
+import atexit
 import errno
 import io
 import itertools
@@ -14,10 +15,11 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
 
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.escaping import printable
@@ -138,6 +140,31 @@ def force_exit_after(stopping: threading.Event, timeout_s: float) -> None:
         os._exit(3)
 
     threading.Thread(target=watch, name="close-guard", daemon=True).start()
+
+
+def run_process(main: Callable[[], int | None]) -> NoReturn:
+    """Run a command in this process as `run_main`, and end the process with its exit code.
+
+    Threads, functions of `atexit` and output are completed as by the interpreter, which is not ended itself: that would
+    end the threads of the bus in the middle of a callback, and abort the process.
+    """
+    code: int | str | None = 1
+    try:
+        code = run_main(main)
+    except SystemExit as end:
+        code = end.code
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+    # As the interpreter: other threads, functions at the end, output.
+    with suppress(KeyboardInterrupt):
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+    if isinstance(code, str):
+        ErrorOutput.write(code)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code if isinstance(code, int) else code is not None)
 
 
 def run_main(main: Callable[[], int | None]) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings
 from hilrig_runtime.config.scene import SceneConfig, TrayConfig
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import InputError, first_errors
 from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import (
     ArmParameters,
@@ -47,7 +47,7 @@ def lab_parameters(lab: LabConfig, where: str) -> dict[str, RigParameters]:
         where: name of its file in messages.
 
     Raises:
-        InputError: names every mistake.
+        InputError: lists the first mistakes.
     """
     found, mistakes = {}, []
     for rig in lab.rigs:
@@ -58,7 +58,7 @@ def lab_parameters(lab: LabConfig, where: str) -> dict[str, RigParameters]:
         else:
             mistakes += () if lab.task is None else task_mistakes(lab.task, found[rig.name])
     if mistakes:
-        raise InputError("\n".join(f"{where}: {mistake}" for mistake in dict.fromkeys(mistakes)))
+        raise InputError("\n".join(f"{where}: {line}" for line in first_errors(list(dict.fromkeys(mistakes)))))
     return found
 
 

@@ -1,11 +1,11 @@
-"""Entry point of `hilrig` and `python -m hilrig_cli`: runs a command and returns its exit code."""
+"""Entry point of `hilrig` and `python -m hilrig_cli`: runs a command and ends with its exit code."""
 
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from hilrig_cli.extras import smallest_extra
 from hilrig_runtime.errors import InputError, OperationError, install_command
-from hilrig_runtime.process.shutdown import run_main
+from hilrig_runtime.process.shutdown import run_process
 
 if TYPE_CHECKING:
     import typer
@@ -14,9 +14,9 @@ _OWN_PACKAGE_PREFIX: Final = "hilrig"
 """Prefix of hilrig's own packages, which every installation has."""
 
 
-def main() -> int:
-    """Run the `hilrig` command; return the exit code."""
-    return run_main(_command)
+def main() -> NoReturn:
+    """Run the `hilrig` command, and end the process with its exit code."""
+    run_process(_command)
 
 
 def _command() -> int:
@@ -61,4 +61,4 @@ def _usage_text(error: "typer.BadParameter") -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -35,6 +35,8 @@ class ServiceStatus:
     """Time of its last report."""
     cpu_share: float = 0.0
     """CPU usage between the last two reports, in processors."""
+    reports: int = 1
+    """Number of reports."""
 
     @property
     def name(self) -> str:
@@ -130,6 +132,8 @@ class LabView:
             status.health.CopyFrom(health)
             del status.health.rig_reports[:]
             status.health.rig_reports.extend(reports)
+        if before is not None:
+            status.reports = before.reports + 1
         if before is not None and before.health.incarnation == health.incarnation:
             elapsed_ns = health.uptime_ns - before.health.uptime_ns
             cpu_ns = health.cpu_ns - before.health.cpu_ns

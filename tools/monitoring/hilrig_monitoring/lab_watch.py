@@ -25,7 +25,6 @@ class LabWatch(Handle):
         self.lab = lab
         self.view = LabView(tuple(rig.name for rig in lab.rigs), lab.bus.may_serve)
         self.lock = threading.Lock()
-        self._report_counts: dict[str, int] = {}
         self._bus = ZenohBus(lab.bus, "tool")
         self._bus.subscribe(HEALTH.key(lab.name, "*", "*"), self._on_health)
 
@@ -41,7 +40,8 @@ class LabWatch(Handle):
             # A stopped service does not answer.
             is_complete = {name.partition("/")[0] for name in expected}.issuperset(SERVICES)
             with self.lock:
-                if is_complete and all(self._report_counts.get(name, 0) > 1 for name in expected):
+                reported = {service.name for service in self.view.services() if service.reports > 1}
+                if is_complete and expected <= reported:
                     return
             time.sleep(0.1)
         with self.lock:
@@ -55,8 +55,6 @@ class LabWatch(Handle):
             return
         with self.lock:
             self.view.update(health, time.monotonic())
-            name = f"{health.service}/{health.instance}"
-            self._report_counts[name] = self._report_counts.get(name, 0) + 1
 
     def close(self) -> None:
         """Leave the bus."""

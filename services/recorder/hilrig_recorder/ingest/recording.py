@@ -57,6 +57,10 @@ class Recording:
     """(sequence, publish time) of the last message in the previous segment, by channel id."""
     horizon_ns: dict[int, int] = field(default_factory=dict)
     """Publish time by channel id; `seen` does not cover older messages of the previous segment, so they are skipped."""
+    silent_ns: dict[int, int] = field(default_factory=dict)
+    """Time by channel id at which its messages stopped, according to the service that missed them, wall clock."""
+    gaps: dict[int, int] = field(default_factory=dict)
+    """Messages missing after the previous segment by channel id that have no loss record in the file yet."""
     counted_losses: int = 0
     """Losses already counted in `counters`; a gap after the previous segment may contain the same messages."""
     end_wall_ns: int | None = None
@@ -96,12 +100,35 @@ class Recording:
         # segments.
         if channel_id != EVENT_CHANNEL and channel_id in self.last:
             last_sequence, last_publish_ns = self.last.pop(channel_id)
-            if publish_ns > last_publish_ns and sequence > last_sequence:
+            if publish_ns > last_publish_ns:
                 gap = sequence - last_sequence - 1
+                if gap < 0:
+                    # Its publisher was restarted meanwhile: its numbers do not tell how many it had published before.
+                    gap = self._estimate_gap(channel_id, last_publish_ns, publish_ns)
                 known = min(gap, self.counted_losses)
                 self.counted_losses -= known
-                self.counters.lost_recorder += gap - known
+                if gap > known:
+                    self.counters.lost_recorder += gap - known
+                    self.gaps[channel_id] = gap - known
         return True
+
+    def count_recorded(self, channel_id: int, numbers: range, incarnation: int) -> int:
+        """Return how many messages of a publisher, by its incarnation and their numbers, the previous segment has."""
+        return sum(
+            channel == channel_id and sequence in numbers and publish_ns >= incarnation
+            for channel, sequence, publish_ns in self.seen or ()
+        )
+
+    def _estimate_gap(self, channel_id: int, begin_ns: int, restarted_ns: int) -> int:
+        """Estimate how many messages a restarted publisher had published, at the rate of the second before the gap."""
+        silent_ns = self.silent_ns.get(channel_id, 0)
+        # An earlier report is of another outage.
+        end_ns = min(silent_ns, restarted_ns) if silent_ns > begin_ns - SECOND_NS else restarted_ns
+        per_second = sum(
+            channel == channel_id and begin_ns - SECOND_NS < publish_ns <= begin_ns
+            for channel, _, publish_ns in self.seen or ()
+        )
+        return max(0, round(per_second * (end_ns - begin_ns) / SECOND_NS))
 
 
 class RecordingOutput(Protocol):

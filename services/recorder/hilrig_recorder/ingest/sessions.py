@@ -32,7 +32,7 @@ from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_runtime.process.outage import OutageDetector, describe_outage
 from hilrig_schemas import Event, LogBatch, OpenSession
-from hilrig_schemas.topics import EVENT, SERVICES, is_name, parse_rig_key
+from hilrig_schemas.topics import COMMAND, EVENT, SERVICES, STATE, is_name, parse_rig_key
 
 BLOCK_PERIOD_NS: Final = 8 * SECOND_NS // 10
 """Maximum time until a received message is written. With batching, tick and sync, messages are safe within 1 s."""
@@ -58,6 +58,11 @@ MAX_RECORDINGS_PER_RIG: Final = 16
 """Maximum number of open files of one rig: its sessions, and those that ended in the last `DRAIN_MAX_NS`."""
 MAX_ENDED_SESSIONS: Final = 4096
 """Maximum number of ended sessions that are remembered."""
+_SILENT_CHANNELS: Final = {
+    Event.STATE_LOST: CHANNEL_OF_TOPIC[STATE.name],
+    Event.COMMAND_LOST: CHANNEL_OF_TOPIC[COMMAND.name],
+}
+"""Event of a service that misses messages → their channel id."""
 _BLOCK_PHASES: Final = 10
 _ENDED_SESSION_MEMORY_NS: Final = 120 * SECOND_NS
 _SESSION_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
@@ -141,6 +146,7 @@ class SessionTracker:
             stream = streams.get(key) or self._add_stream(publisher, key, now_ns)
             if stream is None:
                 continue
+            channel_id = stream.channel_id
             if sequence != stream.expected:
                 missing = stream.missing_before(sequence)
                 if missing < 0:
@@ -149,8 +155,12 @@ class SessionTracker:
                     self._counters.reject(key, f"sequence number {sequence} after {stream.expected - 1}")
                     continue
                 if missing:
-                    self._record_loss(publisher, stream, missing, 0)
-            channel_id = stream.channel_id
+                    numbers = range(stream.expected, sequence)
+                    recorded = (
+                        recording.count_recorded(channel_id, numbers, publisher.incarnation)
+                        for recording in self._rigs[stream.rig].recordings
+                    )
+                    self._record_loss(publisher, stream, missing - max(recorded, default=0), 0)
             event = None
             if channel_id == EVENT_CHANNEL:
                 try:
@@ -249,12 +259,23 @@ class SessionTracker:
             del self._blocked_until[next(iter(self._blocked_until))]
 
     def _record_loss(self, publisher: PublisherState, stream: KeyStream, transport: int, recorder: int) -> None:
+        if not transport + recorder:
+            return
         self.lost_transport += transport
         self.lost_recorder += recorder
         rig = self._rigs[stream.rig]
         rig.record_loss(self._wall_ns, LossCounters(transport, recorder))
         for recording in rig.recordings:
             self._store.record_loss(recording, publisher.name, stream.key, transport, recorder)
+
+    def _record_gaps(self, recording: Recording) -> None:
+        """Add a record of the messages missing after the previous segment: a killed recorder writes no summary."""
+        while recording.gaps:
+            channel_id, count = recording.gaps.popitem()
+            for publisher in self._rigs[recording.rig].publishers.values():
+                for stream in publisher.streams.values():
+                    if stream is not None and (stream.rig, stream.channel_id) == (recording.rig, channel_id):
+                        self._store.record_loss(recording, publisher.name, stream.key, 0, count)
 
     def _reject(self, message: str) -> None:
         self._counters.reject("recording stream", message)
@@ -298,6 +319,11 @@ class SessionTracker:
                 if event.rig in ("", recording.rig):
                     recording.counters.overruns += 1
                     recording.counters.missed_steps += event.overrun_data.missed_steps
+        elif event.kind in _SILENT_CHANNELS:
+            for recording in self._recordings.values():
+                if recording.rig == event.rig:
+                    silent_ns = event.wall_ns - event.watchdog_data.silent_ns
+                    recording.silent_ns[_SILENT_CHANNELS[event.kind]] = silent_ns
 
     def _handle_announcement(self, publisher: PublisherState, batch: LogBatch, now_ns: int) -> None:
         listed = {session.session: session for session in batch.sessions}
@@ -381,6 +407,7 @@ class SessionTracker:
         last_received = self._publishers.last_received()
         self._check_outages(last_received, now_ns, wall_ns)
         for recording in self.recordings:
+            self._record_gaps(recording)
             if recording.seen is not None and now_ns - recording.opened_ns > SETTLE_TIME_NS:
                 # All cached messages were received: no more duplicates.
                 recording.seen = None
@@ -461,6 +488,7 @@ class SessionTracker:
 
     def _close(self, recording: Recording, end: Ending, reason: str) -> None:
         self._rigs[recording.rig].flush_block(self._wall_ns)
+        self._record_gaps(recording)
         self.drop(recording)
         self._block(recording.session, recording.ended_ns + _ENDED_SESSION_MEMORY_NS)
         self._store.close(recording, end, reason)

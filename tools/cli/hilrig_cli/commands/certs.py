@@ -27,13 +27,13 @@ def certs(
         int, typer.Option(min=1, max=36_500, help="Validity, days; the authorities are valid ten times as long.")
     ] = 365,
     revoke: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME",
             help="Instead of creating certificates: make all edges read lab.toml again, which must no longer list NAME "
             "in \\[edge.tls.clients], and close the connections of NAME.",
         ),
-    ] = "",
+    ] = None,
     renew: Annotated[bool, typer.Option("--renew", help="Renew all certificates except the authorities.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -59,7 +59,7 @@ def certs(
     from hilrig_runtime.security.x509 import issue_client, issue_peer, issue_server
 
     lab = load_lab(config)
-    if revoke:
+    if revoke is not None:
         results = revoke_client(lab, revoke)
         if as_json:
             print_json(RevokeOutput(revoked=revoke, edges=results))
