@@ -291,6 +291,13 @@ def test_pauses_of_a_controller_are_found_unless_explained() -> None:
     assert diagnose(replace(paused, windows=regular)) == ()
 
 
+@pytest.mark.parametrize(("rtt_ms", "code"), [(0.1, "delayed_acknowledgement"), (43.0, "network")])
+def test_network_of_the_acknowledgment_time_is_a_network(rtt_ms: float, code: str) -> None:
+    cycles = [cycles_of(np.full(100, 43.5 * MS), np.full(100, 87 * MS))]
+    far = replace(evidence(cycles, rows_of_samples(43.5)), age=AGE, bases=300, min_rtt_ns=rtt_ms * MS)
+    assert [one.code for one in diagnose(far) if one.list == "timing"] == [code]
+
+
 def test_drifting_phase_of_two_connections_is_a_wait() -> None:
     samples, held_ns = rows_of_samples(19.0), (4 + np.arange(400) % 18) * MS
     drifting = replace(evidence([cycles_of(held_ns, np.full(400, 21 * MS))], samples), age=AGE, bases=300)

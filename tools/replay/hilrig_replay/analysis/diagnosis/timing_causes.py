@@ -118,7 +118,8 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
         return None
     for low, high in ACK_DELAYS_NS:
         # Each request of a program waits; a program that itself waits does so between two certain requests.
-        shares = [float(((cycles[name] > low) & (cycles[name] < high)).mean()) for name in ("held_ns", "pause_ns")]
+        waits_ns = [cycles[name] - evidence.min_rtt_ns for name in ("held_ns", "pause_ns")]
+        shares = [float(((wait_ns > low) & (wait_ns < high)).mean()) for wait_ns in waits_ns]
         if min(shares) < 0.5:
             continue
         wait_ns = float(np.median(cycles["held_ns"]))
