@@ -12,13 +12,14 @@ help: ## list the targets
 
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-# On Debian, ensurepip is in the package python3-venv.
+# On Debian, ensurepip is in the package python3-venv. The pip of Python 3.11 takes twice as long as a newer one.
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo 'hilrig needs Python 3.11 or newer: make PYTHON=python3.11' >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && apt-get install --yes -qq python3-venv; } \
 		|| { echo '$(PYTHON) has no module ensurepip: install python3-venv (as root), or use another interpreter: make PYTHON=python3.12' >&2; exit 1; }
 	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --upgrade pip
 
 .venv/ready: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP_INSTALL) '.[all]'

@@ -269,7 +269,8 @@ def basis_errors(device: Plc, commands: Rows) -> NDArray[np.float64]:
     scan = np.searchsorted(ends, read) - 1
     basis = np.searchsorted(writes, commands["state_served_ns"])
     used = np.searchsorted(writes, begins[np.maximum(scan, 0)]) - 1
-    known = (scan >= 0) & (read < commands["write_arrived_ns"]) & (basis < len(writes)) & (used >= 0)
+    arrived_ns: NDArray[np.int64] = commands["write_arrived_ns"]
+    known = (scan >= 0) & (read < arrived_ns) & (basis < len(writes)) & (used >= 0)
     errors_ms: NDArray[np.float64] = (writes[basis[known]] - writes[used[known]]) / 1e6
     return errors_ms
 

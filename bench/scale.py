@@ -192,7 +192,8 @@ def evaluate_recordings(
         table = table[table["wall_ns"] >= begin_ns]
         steps.append(table["step"].astype(np.int64) - table["basis_step"].astype(np.int64))
         loops.append(table["loop"] / 1e6)
-        longest_hold = max(longest_hold, int(np.diff(table["step"].astype(np.int64)).max(initial=0)))
+        table_steps: NDArray[np.int64] = table["step"].astype(np.int64)
+        longest_hold = max(longest_hold, int(np.diff(table_steps).max(initial=0)))
         undisturbed.append(steal.undisturbed(table["wall_ns"]))
         lost += result.lost.transport + result.lost.recorder
         for link, times_ms in link_times(run, begin_ns).items():
@@ -222,14 +223,19 @@ def link_times(run: Run, begin_ns: int) -> dict[str, NDArray[np.float64]]:
     known = (command["basis_step"] > 0) & (ticks < len(states))
     applied, command, basis = applied[known], command[known], states[ticks[known]]
     # With many rigs the edge holds a command that has time until the tick: this wait is not part of the link.
-    is_near = applied["sampled_ns"] - command["sent_ns"] < DEADLINE_MARGIN_NS
+    sent_ns: NDArray[np.int64] = command["sent_ns"]
+    is_near = applied["sampled_ns"] - sent_ns < DEADLINE_MARGIN_NS
     if not is_near.any():
         # One rig, whose controller never writes near the tick: the edge held no command.
         is_near[:] = True
+    basis_ns: NDArray[np.int64] = basis["sampled_ns"]
+    served_ns: NDArray[np.int64] = command["state_served_ns"]
+    state_arrived_ns: NDArray[np.int64] = command["state_arrived_ns"]
+    command_arrived_ns: NDArray[np.int64] = applied["command_arrived_ns"]
     return {
-        "state link": (command["state_arrived_ns"] - basis["sampled_ns"]) / 1e6,
-        "read to write": (command["sent_ns"] - command["state_served_ns"]) / 1e6,
-        "command link": (applied["command_arrived_ns"] - command["sent_ns"])[is_near] / 1e6,
+        "state link": (state_arrived_ns - basis_ns) / 1e6,
+        "read to write": (sent_ns - served_ns) / 1e6,
+        "command link": (command_arrived_ns - sent_ns)[is_near] / 1e6,
     }
 
 

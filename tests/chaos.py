@@ -253,7 +253,8 @@ def check_torque(faults: list[Fault], recorded: Recorded) -> Iterator[str]:
             times = states["sampled_ns"]
             during = states[(times > fault.begin_ns + limit_ns) & (times < fault.end_ns)]
             if during["torque"].any():
-                late_ns = times[(times < fault.end_ns) & states["torque"]].max() - fault.begin_ns
+                torque = states["torque"]
+                late_ns = times[(times < fault.end_ns) & torque].max() - fault.begin_ns
                 yield f"{fault}: rig {rig + 1} has torque {late_ns / 1e6:.0f} ms after it, limit {limit_ns / 1e6:.0f}"
 
 
@@ -262,7 +263,8 @@ def check_losses(faults: list[Fault], recorded: Recorded, seen: np.ndarray) -> I
     lost = []
     for rig, states in recorded.states.items():
         known = set(zip(states["incarnation"].tolist(), states["step"].tolist(), strict=True))
-        own = seen[(seen["rig"] == rig) & (seen["flags"] & IN_SESSION > 0)]
+        rigs, flags = seen["rig"], seen["flags"]
+        own = seen[(rigs == rig) & (flags & IN_SESSION > 0)]
         keys = zip(own["incarnation"].tolist(), own["step"].tolist(), strict=True)
         lost += [int(ns) for key, ns in zip(keys, own["sampled_ns"], strict=True) if key not in known]
     remaining = np.array(sorted(lost), np.int64)

@@ -1,7 +1,7 @@
 """Corpus of runs with a known cause, in simulated time, and the error rate of the diagnosis on its judged part.
 
-The thresholds were chosen on `tuning`; `revision`, `revision2` and `revision3` were judged parts until a rule was
-changed after their result. `judged` has other laws and set points, and ranges that are disjoint from all of them; they
+The thresholds were chosen on `tuning`; `revision` to `revision4` were judged parts until a rule was changed after their
+result. `judged` has other laws and set points, and ranges that are disjoint from all of them; they
 were written down before the first run of that part. Causes that need real processes are in
 `tests/rig/test_diagnosis_live.py`.
 
@@ -167,7 +167,7 @@ PARTS: Final = {
         # Of the first draw, some runs really oscillated (`kp`, `overshooting`), or were hardly delayed (`beating`).
         seed=2,
     ),
-    "judged": Part(
+    "revision4": Part(
         ("parabola", "twice filtered", "square root", "directional", "double exponential"),
         ("septic", "chirp", "circle", "exponential"),
         {
@@ -194,6 +194,31 @@ PARTS: Final = {
         # velocities, which acts on older positions, and decaying oscillations were taken for limit cycles: that rule
         # was changed, and the ranges of `overshooting` and `cycling`.
         seed=4,
+    ),
+    "judged": Part(
+        ("second order", "predicted", "arctangent", "progressive damping", "configuration"),
+        ("sigmoid", "lissajous", "modified sine", "random walk"),
+        {
+            "kp": ((0.0785, 0.0795), (0.2505, 0.2515), (0.2582, 0.2595)),
+            "wait": ((16.02, 16.18), (120.5, 124.5), (231, 280)),
+            "slow": ((24.2, 25.8), (180.5, 184.5), (281, 330)),
+            "slow_computing": ((19, 21.8), (27.1, 27.9), (231, 270)),
+            "injected": ((24.2, 24.8), (140.5, 144.5), (241, 280)),
+            "beating": ((0.9805, 0.9895), (1.004, 1.0095)),
+            "stall": ((78.3, 79.7), (702, 718), (1310, 1600)),
+            "behind": ((9.5, 10.8), (60.05, 60.25), (61.85, 61.95)),
+            "phase": ((2.52, 2.58), (6.02, 6.08), (17.6, 18.0)),
+            "gap": ((892, 898), (4510, 4590), (7050, 8000)),
+            "saturating": ((18.3, 19.7), (30.3, 31.7), (76, 90)),
+            "cycling": ((3.955, 3.995), (14.05, 14.45), (18.1, 20)),
+            "noise": ((0.1955, 0.1995), (0.3783, 0.3797), (0.605, 0.65)),
+            "overshooting": ((0.4042, 0.4048), (1.201, 1.209), (1.51, 1.55)),
+            "error": ((7, 7.9), (61.55, 61.95), (85.2, 85.8)),
+            "limit": ((2.51, 2.59), (3.51, 3.59), (4.6, 5.5)),
+            "starved": ((0.5402, 0.5408), (0.8492, 0.8498), (0.9592, 0.9598)),
+            "pause": ((158.2, 159.8), (450.5, 454.5), (495.2, 497)),
+        },
+        seed=5,
     ),
 }
 
@@ -242,7 +267,20 @@ def goal_of(kind: str, random: Random) -> Callable[[float], np.ndarray]:
             return place.copy()
 
         return approach
-    move_s = {"minimum jerk": 0.8, "cycloid": 1.2, "trapezoid": 1.4, "alternate": 1.0, "septic": 1.5}.get(kind, 1.6)
+    if kind == "lissajous":
+        rates, phases = np.array([2.0, 3.0, 1.0, 4.0]) * random.uniform(0.25, 0.45), random.uniform(0, 2 * np.pi, 4)
+        return lambda t: corners[0] * 0.5 + [0, 0, 40, 0] + np.array([17, 13, 15, 9]) * np.sin(rates * t + phases)
+    if kind == "random walk":
+        # Cosines between places that are near each other.
+        places = corners[0] * 0.4 + [0, 0, 50, 0] + np.cumsum(random.uniform(-1, 1, (12, 4)) * [9, 8, 6, 7], axis=0)
+
+        def wander(t: float) -> np.ndarray:
+            number, share = int(t / 2.2) % 11, t / 2.2 % 1
+            return np.asarray(places[number] + (1 - np.cos(np.pi * share)) / 2 * (places[number + 1] - places[number]))
+
+        return wander
+    times_s = {"minimum jerk": 0.8, "cycloid": 1.2, "trapezoid": 1.4, "alternate": 1.0, "septic": 1.5, "sigmoid": 1.8}
+    move_s = times_s.get(kind, 1.6)
 
     def moves(t: float) -> np.ndarray:
         number = int(t / every_s)
@@ -251,6 +289,18 @@ def goal_of(kind: str, random: Random) -> Callable[[float], np.ndarray]:
             share = share**3 * (10 - 15 * share + 6 * share**2)
         if kind == "septic":
             share = share**4 * (35 - 84 * share + 70 * share**2 - 20 * share**3)
+        if kind == "sigmoid":
+            share = (np.tanh(6 * share - 3) / np.tanh(3) + 1) / 2
+        if kind == "modified sine":
+            # A quarter of a fast sine, half of a slow one, and again a quarter: accelerations of a cam.
+            fast, slow = np.sin(4 * np.pi * share), np.sin((np.pi + 4 * np.pi * share) / 3)
+            share = (
+                (np.pi * share - fast / 4)
+                if share < 0.125
+                else (2 + np.pi * share - 9 / 4 * slow)
+                if share < 0.875
+                else (4 + np.pi * share - fast / 4)
+            ) / (4 + np.pi)
         if kind == "trapezoid":
             # A quarter of the time to accelerate, and another one to decelerate.
             share = (
@@ -333,6 +383,21 @@ def law_of(kind: str, goal: Callable[[float], np.ndarray], kp: float, period_s: 
             place = q if len(seen) == 1 else 0.8 * q + 0.2 * (place + period_s * speed)
             speed = 0.6 * speed + 0.4 * (place - before) / period_s
             return np.asarray(p * (goal(t) - place) - d * speed + WEIGHT)
+        if kind == "second order":
+            # The backward difference of second order, filtered.
+            speed = 0.5 * speed + 0.25 * (3 * q - 4 * _at(seen, 1) + _at(seen, 2)) / period_s
+            return np.asarray(p * error - d * speed + WEIGHT)
+        if kind in ("predicted", "arctangent", "progressive damping", "configuration"):
+            speed = 0.35 * speed + 0.65 * (q - _at(seen, 1)) / period_s
+            if kind == "predicted":
+                error = error - 0.5 * period_s * speed
+            if kind == "arctangent":
+                error = 25 * np.arctan(error / 25)
+            if kind == "progressive damping":
+                return np.asarray(p * error - d * (1 + np.abs(speed) / 120) * speed + WEIGHT)
+            if kind == "configuration":
+                return np.asarray((0.9 + 0.2 * np.cos(np.radians(q[1]))) * (p * error - d * speed) + WEIGHT)
+            return np.asarray(p * error - d * speed + WEIGHT)
         if kind == "soft band":
             speed = 0.4 * speed + 0.6 * (q - _at(seen, 1)) / period_s
             return np.asarray(p * error * np.abs(error) / (np.abs(error) + 0.5) - d * speed + WEIGHT)

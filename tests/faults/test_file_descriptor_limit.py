@@ -15,7 +15,8 @@ from hilrig_runtime.security.x509 import issue_server, make_authority
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH
 from support.bus_certificates import NOW, write
-from support.labs import HILRIG, free_ports, write_lab
+from support.hilrig_process import HILRIG
+from support.labs import free_ports, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 LIMIT = 64

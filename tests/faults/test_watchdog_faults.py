@@ -17,7 +17,8 @@ from google.protobuf.message import Message
 from mcap.reader import make_reader
 
 from hilrig_schemas import Event, JointState, TorqueCommand
-from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.hilrig_process import HILRIG
+from support.labs import RunningLab, hilrig, write_lab
 from support.namespaces import Network, require_namespaces
 from support.waiting import LONG_TIMEOUT_S, eventually
 

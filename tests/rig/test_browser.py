@@ -13,7 +13,8 @@ import pytest
 
 from hilrig_replay.plots.palette import JOINT_COLORS, rgb
 from support.browser import CHROMIUM, Browser, share_of
-from support.labs import HILRIG, hilrig
+from support.hilrig_process import HILRIG
+from support.labs import hilrig
 from support.recordings import Script, make, record, write
 from support.waiting import LONG_TIMEOUT_S
 

@@ -30,7 +30,8 @@ from hilrig_runtime.listen_address import ListenAddress
 from support.browser import CHROMIUM, Browser
 from support.bus_certificates import make_bus_folder
 from support.edge_rig import RawClient
-from support.labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
+from support.hilrig_process import HILRIG, ForkedPopen
+from support.labs import RunningLab, hilrig, steady_controller, write_lab
 from support.long_tests import LONG
 from support.recordings import Script, record
 from support.waiting import LONG_TIMEOUT_S, eventually
@@ -73,7 +74,7 @@ class RunningConsole:
 @contextmanager
 def console(config: Path, *options: str, listen: str = "127.0.0.1:0") -> Iterator[RunningConsole]:
     command = [*HILRIG, "console", "--config", str(config), "--listen", listen, *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = ForkedPopen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
         line = process.stdout.readline()

@@ -15,7 +15,8 @@ import pytest
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.process.discovery import list_services, query_services
-from support.labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
+from support.hilrig_process import HILRIG, ForkedPopen
+from support.labs import RunningLab, free_ports, hilrig, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
@@ -133,7 +134,7 @@ def test_missing_router_is_an_error_and_missing_services_are_not(routed: Path) -
     assert "no zenoh router answers" in results(alone)["bus"][0]["text"]
     assert "services" not in results(alone), "services are unknown without the bus"
     command = [*HILRIG, "router", "--stop-with-parent", "--config", str(routed)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as router:
+    with ForkedPopen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as router:
         assert router.stdout is not None
         assert router.stdout.readline().startswith("router of lab 'lab' at tcp/127.0.0.1:")
         assert hilrig("doctor", "--service", "router", "--config", routed).returncode == 0

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.hilrig_process import HILRIG
+from support.labs import RunningLab, hilrig, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig

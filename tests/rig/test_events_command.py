@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.hilrig_process import HILRIG, ForkedPopen
+from support.labs import RunningLab, hilrig, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
@@ -45,7 +46,7 @@ def test_invalid_filters_are_refused(arguments: tuple[str, ...], message: str) -
 def test_live_events_and_commands_for_several_rigs(tmp_path: Path) -> None:
     config = write_lab(tmp_path, rigs=3)
     with RunningLab(config) as lab:
-        follower = subprocess.Popen(
+        follower = ForkedPopen(
             [*HILRIG, "events", "--json", "--rig", "rig2", "--config", lab.config],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

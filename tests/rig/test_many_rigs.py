@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from support.labs import HILRIG, RunningLab, free_ports, hilrig, steady_controller, write_lab
+from support.hilrig_process import HILRIG
+from support.labs import RunningLab, free_ports, hilrig, steady_controller, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from support.labs import HILRIG
+from support.hilrig_process import HILRIG
 from support.recordings import record
 
 pytestmark = pytest.mark.rig

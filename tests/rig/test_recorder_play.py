@@ -11,7 +11,8 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState, RigConfig
 from hilrig_schemas.topics import CONFIG, STATE
 from support import recordings
-from support.labs import HILRIG, hilrig
+from support.hilrig_process import HILRIG, ForkedPopen
+from support.labs import hilrig
 from support.recorder_rig import make_lab, sending
 from support.waiting import eventually
 
@@ -23,7 +24,7 @@ def test_played_recording_is_received_like_a_running_rig(tmp_path: Path) -> None
     path = recordings.write(tmp_path / "run.mcap", made, script=recordings.Script(seconds=2))
     received: list[tuple[float, bytes]] = []
     command = [*HILRIG, "play", str(path), "--config", str(config), "--loop", "--rig", "rig7"]
-    player = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    player = ForkedPopen(command, stderr=subprocess.PIPE, text=True)
     try:
         with ZenohBus(lab.bus, "tool") as bus:
             bus.subscribe(STATE.key(lab.name, "rig7"), lambda _, payload: received.append((time.monotonic(), payload)))

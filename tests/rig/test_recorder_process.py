@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from support.labs import HILRIG, free_ports, hilrig
+from support.hilrig_process import HILRIG
+from support.labs import free_ports, hilrig
 from support.recorder_rig import (
     RecorderProcess,
     Senders,

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,8 @@ from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_schemas import Event, JointState, RigBatch, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, CONFIG, EVENT, STATE
 from hilrig_sim.arm.model import RigParameters
-from support.labs import HILRIG, hilrig, write_lab
+from support.hilrig_process import HILRIG, ForkedPopen
+from support.labs import hilrig, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
@@ -28,7 +28,7 @@ class SimProcess:
         self.events: list[Event] = []
         self.log = config.parent / "sim.log"
         with self.log.open("w") as log:
-            self.process = subprocess.Popen(
+            self.process = ForkedPopen(
                 [*HILRIG, "sim", "--config", str(config)], stdout=log, stderr=log, cwd=config.parent
             )
         self.bus = ZenohBus(self.lab.bus, "edge")

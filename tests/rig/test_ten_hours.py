@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_schemas import Event, JointState, ModbusTraffic, TorqueCommand
-from support.labs import HILRIG
+from support.hilrig_process import HILRIG
 from support.recordings import MS, Script, TimedMessage, make, write
 
 pytestmark = [

@@ -18,7 +18,7 @@ from hilrig_replay.io.run import open_run
 from hilrig_replay.rerun_view.view import save_rrd, send_runs
 from hilrig_replay.rerun_view.viewer import environment, executable, free_port, running_viewer
 from support.browser import share_of
-from support.labs import HILRIG
+from support.hilrig_process import HILRIG
 from support.recordings import Script, record
 from support.waiting import LONG_TIMEOUT_S, eventually
 

@@ -191,7 +191,9 @@ def check_against_capture(session: Session) -> None:
     assert (edge_ns <= answered_ns + US).all()
     assert np.percentile(answered_ns - edge_ns, 95) < 2 * MS
 
-    sampled_ns = dict(zip(session.run.states["step"].tolist(), session.run.states["sampled_ns"].tolist(), strict=True))
+    states = session.run.states
+    steps, times_ns = states["step"].tolist(), states["sampled_ns"].tolist()
+    sampled_ns = dict(zip(steps, times_ns, strict=True))
     # Age, at each step that the client was served.
     assert session.report.ages is not None
     ages_ns = {

@@ -250,7 +250,7 @@ def _bomb(path: Path, random: Random) -> None:
     """Add a chunk that expands to much more than the file, or says so."""
     data = bytearray(_good_bytes())
     raw_size = random.choice((1 << 30, 100 << 20, 1 << 43, (1 << 64) - 1, 0))
-    packed = _BOMB if random.random() < 0.5 else zstandard.compress(b"abc")
+    packed = _compressed_gib() if random.random() < 0.5 else zstandard.compress(b"abc")
     head = struct.pack("<QQQII4sQ", 0, 1, raw_size, random.choice((0, 1)), 4, b"zstd", len(packed))
     chunk = RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(packed)) + head + packed
     if random.random() < 0.5:
@@ -260,13 +260,13 @@ def _bomb(path: Path, random: Random) -> None:
     path.write_bytes(data)
 
 
-def _compressed_zeros(size: int) -> bytes:
+@cache
+def _compressed_gib() -> bytes:
+    """A GiB of zeros, compressed."""
+    size = 1 << 30
     stream = zstandard.ZstdCompressor().compressobj(size=size)
     block = bytes(1 << 20)
     return b"".join(stream.compress(block) for _ in range(size >> 20)) + stream.flush()
-
-
-_BOMB = _compressed_zeros(1 << 30)
 
 
 def _store(path: Path, data: bytearray, random: Random) -> None:

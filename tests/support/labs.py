@@ -1,27 +1,21 @@
 """Complete labs for tests: `hilrig up` on free ports in a temporary folder, and `hilrig` commands."""
 
-import contextlib
-import functools
-import json
 import os
 import random
 import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
+from support.hilrig_process import HILRIG, ForkedPopen
 from support.json_output import check_json_output
 from support.waiting import eventually
-
-HILRIG = [sys.executable, "-m", "hilrig_cli"]
-
 
 PORTS = range(10_000, 32_000)
 """Below the ports that the system gives to outgoing connections: those of other tests could take a port that is probed
@@ -51,57 +45,19 @@ def hilrig(
     """
     command = list(map(str, arguments))
     with TemporaryDirectory() as folder:
-        out, err = (Path(folder) / name for name in ("out", "err"))
-        for path in (out, err):
-            path.touch()
-        job = {"arguments": command, "cwd": str(cwd or Path.cwd()), "environ": dict(os.environ)}
-        job |= {"out": str(out), "err": str(err)}
-        with _SERVER_LOCK:
-            code = _run_job(job, timeout_s)
-        if code is None:
-            raise subprocess.TimeoutExpired(command, timeout_s, out.read_text(), err.read_text())
-        done = subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+        paths = [Path(folder) / name for name in ("out", "err")]
+        with paths[0].open("w") as out, paths[1].open("w") as err:
+            process = ForkedPopen([*HILRIG, *command], stdin=subprocess.DEVNULL, stdout=out, stderr=err, cwd=cwd)
+        try:
+            code = process.wait(timeout_s)
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+        done = subprocess.CompletedProcess(command, code, *(path.read_text() for path in paths))
     if "--json" in command and code in (0, 1):
         check_json_output(command, done.stdout)
     return done
-
-
-_SERVER_LOCK = threading.Lock()
-"""Held during a job: the server does one at a time, and its replies have no names."""
-
-
-def _run_job(job: dict[str, Any], timeout_s: float) -> int | None:
-    """Exit code of a job of the command server; None: it was killed after its time-out."""
-    server, pid = _command_server(), 0
-    assert server.stdin is not None
-    assert server.stdout is not None
-    try:
-        server.stdin.write(json.dumps(job) + "\n")
-        server.stdin.flush()
-        pid = int(server.stdout.readline())
-        killer = threading.Timer(timeout_s, os.kill, (pid, signal.SIGKILL))
-        killer.start()
-        try:
-            code = int(server.stdout.readline())
-        finally:
-            late = not killer.is_alive()
-            killer.cancel()
-    except BaseException:
-        # The test was interrupted: the next job must not get the replies of this one.
-        _command_server.cache_clear()
-        server.kill()
-        if pid:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        raise
-    return None if late else code
-
-
-@functools.cache
-def _command_server() -> "subprocess.Popen[str]":
-    """Server for all commands of this process; it ends when this process ends and closes its standard input."""
-    command = [sys.executable, str(Path(__file__).with_name("command_server.py"))]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def write_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> Path:
@@ -155,15 +111,14 @@ class RunningLab:
         Raises:
             LookupError: no such service is running.
         """
-        for pid in _children(self.process.pid):
-            arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-            if name.encode() in arguments:
+        for pid in self.service_pids():
+            if name in _arguments(pid):
                 return pid
         raise LookupError(name)
 
     def service_pids(self) -> list[int]:
-        """Process ids of all children of `up`."""
-        return _children(self.process.pid)
+        """Process ids of the services."""
+        return [pid for pid in _children(self.process.pid) if "hilrig_cli" in _arguments(pid)]
 
     def stop(self, number: signal.Signals = signal.SIGTERM, *, timeout_s: float = 30.0) -> int:
         """Send a signal to `up` and wait until it exits; returns the exit code."""
@@ -175,7 +130,7 @@ class RunningLab:
         with self.log.open("w") as log:
             # The lab ends with the test process, also if that is killed.
             command = [*HILRIG, "up", "--stop-with-parent", "--config", str(self.config), *self.options]
-            self.process = subprocess.Popen(
+            self.process = ForkedPopen(
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=self.config.parent, start_new_session=True
             )
 
@@ -216,6 +171,10 @@ def steady_controller(port: int) -> Iterator[None]:
         yield
     finally:
         process.communicate()
+
+
+def _arguments(pid: int) -> list[str]:
+    return Path(f"/proc/{pid}/cmdline").read_text().split("\0")
 
 
 def _children(parent: int) -> list[int]:

@@ -24,7 +24,8 @@ from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event, JointState, OpenSession, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMAND, CONFIG, STATE, alive_key
-from support.labs import HILRIG, free_ports, write_lab
+from support.hilrig_process import HILRIG, ForkedPopen
+from support.labs import free_ports, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 Key = tuple[str, int, bytes]
@@ -41,7 +42,7 @@ class RecorderProcess:
         self.log = config.parent / f"recorder{''.join(options[:2])}.log"
         command = [*program, "recorder", "--config", str(config), *options]
         with self.log.open("a") as log:
-            self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=config.parent)
+            self.process = ForkedPopen(command, stdout=log, stderr=log, cwd=config.parent)
 
     def kill(self) -> None:
         """Kill the process with SIGKILL."""

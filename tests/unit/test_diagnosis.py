@@ -216,8 +216,34 @@ def test_refused_writes_are_of_competing_clients() -> None:
     found = timing_causes.competing_clients(evidence([replace(EMPTY, traffic=traffic)]))
     assert found is not None
     assert (found.evidence["refused"], found.evidence["refused_share"], found.evidence["clients"]) == (10, 0.1, 1)
+    assert found.evidence["share"] == 1
+    traffic["arrived_ns"] = np.arange(100) * 100 * MS
+    found = timing_causes.competing_clients(evidence([replace(EMPTY, traffic=traffic)]))
+    assert found is not None
+    assert found.evidence["share"] == 0.2
     traffic["exception"] = np.where(np.arange(100) < 4, 6, 2)
     assert timing_causes.competing_clients(evidence([replace(EMPTY, traffic=traffic)])) is None
+
+
+def test_refused_client_precedes_the_age_of_the_other() -> None:
+    traffic = np.zeros(500, TRAFFIC_DTYPE)
+    traffic["function"], traffic["arrived_ns"] = 16, np.arange(500) * 10 * MS
+    traffic["exception"][:400:2] = 6
+    stalled = replace(evidence([replace(EMPTY, traffic=traffic)], rows_of_samples(1.0)), age=AGE, bases=300)
+    stalled = replace(stalled, stalls=Stalls(10, 300 * MS, area_ns2=10 * (300.0 * MS) ** 2 / 2))
+    shares = [(one.code, one.evidence["share"]) for one in diagnose(stalled)]
+    assert shares == [("competing_clients", 0.8), ("simulation_stall", 0.75)]
+
+
+def test_share_includes_the_age_that_timestamps_hide() -> None:
+    # Each command misses a tick because of its phase, and acts on the previous poll: 20 ms of 60 ms each.
+    def law(t: float, q: np.ndarray) -> np.ndarray:
+        return np.asarray(0.2 * (np.array([40, 30, 20, 10]) * np.sin(t) - q) * (1, 0.6, 0.1, 0.02))
+
+    [run] = virtual_runs([Program(law, phase_ms=19.5, behind=1)])
+    found = {one.code: one for one in measure(run).findings if one.list == "timing"}
+    assert list(found) == ["previous_poll", "beating"]
+    assert [one.evidence["share"] for one in found.values()] == pytest.approx([20 / 60] * 2, rel=0.05)
 
 
 @pytest.mark.parametrize("kind", ["edge", "simulation"])
@@ -265,6 +291,13 @@ def test_pauses_of_a_controller_are_found_unless_explained() -> None:
     assert diagnose(replace(paused, windows=regular)) == ()
 
 
+@pytest.mark.parametrize(("rtt_ms", "code"), [(0.1, "delayed_acknowledgement"), (43.0, "network")])
+def test_network_of_the_acknowledgment_time_is_a_network(rtt_ms: float, code: str) -> None:
+    cycles = [cycles_of(np.full(100, 43.5 * MS), np.full(100, 87 * MS))]
+    far = replace(evidence(cycles, rows_of_samples(43.5)), age=AGE, bases=300, min_rtt_ns=rtt_ms * MS)
+    assert [one.code for one in diagnose(far) if one.list == "timing"] == [code]
+
+
 def test_drifting_phase_of_two_connections_is_a_wait() -> None:
     samples, held_ns = rows_of_samples(19.0), (4 + np.arange(400) % 18) * MS
     drifting = replace(evidence([cycles_of(held_ns, np.full(400, 21 * MS))], samples), age=AGE, bases=300)
@@ -308,6 +341,20 @@ def test_oscillation_that_decays_is_no_limit_cycle(decay_s: float, found: bool) 
     assert [one.code for one in observed] == ["limit_cycle"] * found
 
 
+@pytest.mark.parametrize("on_stop", [True, False])
+def test_rests_on_the_stops_are_of_an_oscillation(on_stop: bool) -> None:
+    time_s = np.arange(1000) * 0.02
+    states = np.zeros(1000, STATE_DTYPE)
+    states["step"], states["session"], states["command_seq"] = np.arange(1000), 1, np.arange(1, 1001)
+    states["effort"][:, 3] = 1.0
+    states["position"][:, 3] = np.clip(1.2 * np.sin(2 * np.pi * 1.5 * time_s), -1.0, 1.0)
+    states["velocity"][:, 3] = np.gradient(states["position"][:, 3], 0.02)
+    if on_stop:
+        states["limit_flags"] = 8 * (states["position"][:, 3] <= -1.0) + 128 * (states["position"][:, 3] >= 1.0)
+    observed = control_observations.limit_cycle(evidence([replace(EMPTY, states=states)]), [])
+    assert [one.code for one in observed] == ["limit_cycle"] * on_stop
+
+
 def test_writes_after_the_first_one_are_no_wait() -> None:
     commands = np.zeros(400, COMMAND_DTYPE)
     # A read every 100 ms, and a write 1 ms later and again every 20 ms.
@@ -322,6 +369,9 @@ def test_writes_after_the_first_one_are_no_wait() -> None:
     [found] = [one for one in diagnose(repeated) if one.list == "timing"]
     assert found.code == "slow_polling"
     assert found.text.startswith("the program polls every 100 ms, and writes again without reading;")
+    # A few writes without a read, such as the last one, are no repetition.
+    [found] = [one for one in diagnose(replace(repeated, bases=295)) if one.code == "slow_polling"]
+    assert "writes again" not in found.text
     # One write a register is one answer.
     commands["write_arrived_ns"] = commands["state_served_ns"] + (1 + number % 5) * MS
     cycles = replace(repeated, windows=[replace(EMPTY, commands=commands)]).cycles()

@@ -4,7 +4,7 @@ from itertools import product
 
 import pytest
 
-from diagnosis_corpus import PARTS, RUNS, UNDISTURBED, corpus, diagnosed, table
+from diagnosis_corpus import PARTS, RUNS, UNDISTURBED, case_of, corpus, diagnosed, table
 
 
 def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
@@ -31,6 +31,14 @@ def test_a_sample_of_forty_runs_is_diagnosed() -> None:
     results = list(diagnosed(cases))
     missed = [(one.case.code, one.timing, one.control) for one in results if not one.found or one.wrong]
     assert len(missed) <= 1, missed
+
+
+def test_noise_that_drives_a_torque_to_its_limits_is_found() -> None:
+    # The torque is at a limit on more than half of the steps.
+    case = case_of("noise_amplification", "revision4", 3)
+    case.program.seconds = 5.0
+    [result] = diagnosed([case])
+    assert result.control == ["saturation", "noise_amplification"]
 
 
 @pytest.mark.long("takes minutes")

@@ -6,7 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.feedback import contains_rounding_errors, follows_positions, is_restoring_law
+from hilrig_replay.analysis.feedback import (
+    RoundingGains,
+    contains_rounding_errors,
+    follows_positions,
+    is_restoring_law,
+)
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
 from hilrig_sim.plant.plant import Plant
 from support.recordings import PARAMETERS, REGISTER_SCALE
@@ -159,3 +164,9 @@ def test_each_evidence_is_sufficient() -> None:
     assert not is_restoring_law(filtered)
     weak = series(pd((0.02, 0.0, 0.0, 0.0), (0.0,) * 4, hold, STEP_S))
     assert is_restoring_law(weak)
+
+
+def test_noise_is_of_significant_gains_only() -> None:
+    gains, statistics = np.zeros((4, 4)), np.zeros((4, 4))
+    gains[0], statistics[0] = (0.3, 5.0, -5.0, 0.4), (400.0, 1.5, 1.5, 60.0)
+    assert RoundingGains(gains, statistics, np.arange(4.0)).noise == pytest.approx([0.5 / np.sqrt(12), 0, 0, 0])

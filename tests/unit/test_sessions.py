@@ -354,6 +354,15 @@ def test_events_wait_for_the_messages_before_them() -> None:
     assert bench.file.recording.end_wall_ns == bench.wall
 
 
+def test_source_counts_as_received_when_its_stream_arrives() -> None:
+    bench = TrackerBench()
+    bench.sim.put(EVENT, "rig1", Event(rig="rig1", kind=Event.RESET), bench.wall)
+    bench.accept(bench.sim.events())
+    assert bench.tracker.last_received().keys() == set()
+    bench.states(1)
+    assert bench.tracker.last_received().keys() == {"sim/1"}
+
+
 def test_stream_has_passed_its_last_event() -> None:
     bench = TrackerBench()
     bench.start()

@@ -65,7 +65,8 @@ def test_row_with_jitter_is_recomputed(jitter: tuple[StudyConfig, SweepResult], 
     half, rows = int(np.argmin(np.abs(gains - 0.5))), (cells["controller"] == 1) & (cells["ix"] == column)
     at_half = rows & (cells["iy"] == half)
     assert at_half.sum() == 3
-    assert (np.median(results["loop_p50_ms"][at_half]), np.median(results["loop_p99_ms"][at_half])) == (p50, p99)
+    p50_ms, p99_ms = results["loop_p50_ms"][at_half], results["loop_p99_ms"][at_half]
+    assert (np.median(p50_ms), np.median(p99_ms)) == (p50, p99)
     settled = np.array([results["settled"][rows & (cells["iy"] == row)].all() for row in range(len(gains))])
     assert gains[1:][~settled[1:]].min() == pytest.approx(stable + 0.05)
     found = cost_interval(study, swept, 1)

@@ -183,7 +183,8 @@ class RigStateEncoder:
         """
         world, index = self._world, self.index
         columns = (world.x, world.y, world.z, world.yaw, *world.velocity)
-        motions = zip(self._part_names, *(column[:, index].tolist() for column in columns), strict=False)
+        values = [column[:, index].tolist() for column in columns]
+        motions = zip(self._part_names, *values, strict=False)
         held = int(world.held[index])
         self._held_part = self._part_names[held] if held != NO_PART else ""
         parts = [

@@ -76,7 +76,8 @@ def traces(study: StudyConfig, folder: Path) -> list[Trace]:
         if not math.isnan(results["failed_s"][0]):
             outcome_text = f"fails at {results['failed_s'][0]:.2f} s"
         # After a failure the simulated arm is parked: show no data.
-        active = np.where(np.isnan(results["failed_s"]) | (time_s <= results["failed_s"]), 1.0, np.nan)[:, np.newaxis]
+        failed_s = results["failed_s"]
+        active = np.where(np.isnan(failed_s) | (time_s <= failed_s), 1.0, np.nan)[:, np.newaxis]
         error = active * (outcome.positions[:, :, 0] - goal) * JOINT_SCALE
         found.append(Trace(letter, point, number, time_s, error, active * outcome.efforts[:, :, 0], outcome_text))
     return found

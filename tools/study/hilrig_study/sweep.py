@@ -254,7 +254,8 @@ def sweep(
 def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
     """Return which runs have no random values, (R,)."""
     unimpaired = np.array([study.link_impairments(number).is_inactive for number in range(len(study.controllers))])
-    return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & unimpaired[cells["controller"]])
+    jitter_ms, loss, controller = cells["jitter_ms"], cells["loss"], cells["controller"]
+    return np.asarray((jitter_ms == 0) & (loss == 0) & unimpaired[controller])
 
 
 def _batches(cells: NDArray[np.void]) -> Iterator[NDArray[np.intp]]:

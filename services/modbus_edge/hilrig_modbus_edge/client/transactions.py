@@ -5,6 +5,7 @@ skips some failures silently, and waits for its timeout on others: a wrong ident
 connection, a late response. They are detected here, and fail the request at once with a `ControllerError`.
 """
 
+import asyncio
 import logging
 import ssl
 import struct
@@ -186,7 +187,9 @@ class ControllerConnection:
         """
         transactions = self._transactions
         transactions.comm_params.timeout_connect = self._settings.connect_timeout_ms / 1e3
-        if not await self._client.connect():
+        connected = await self._client.connect()
+        _raise_cancellation()
+        if not connected:
             raise connection_fault(transactions.connect_error or TimeoutError(), *self._address)
         transactions.comm_params.timeout_connect = self._settings.timeout_ms / 1e3
 
@@ -282,6 +285,7 @@ class ControllerConnection:
             raise self._timeout(f"{action} {block}", expected.function) from None
         finally:
             transactions.expected = None
+            _raise_cancellation()
         self._timed_out = False
         head = _HEAD.pack(expected.function, block.address, block.count)
         self._log(head, sent_ns, self._monotonic_ns(), response.exception_code if response.isError() else 0)
@@ -300,6 +304,13 @@ class ControllerConnection:
         text = f"no response {where}: check the controller's load, cable and unit identifier"
         # The first one may be a lost packet, or a controller that was busy for a moment.
         return ControllerError(FaultKind.TIMEOUT, text, closes=repeated)
+
+
+def _raise_cancellation() -> None:
+    """Cancel the current task if that was requested: before Python 3.12, `wait_for` drops it if a response arrives."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
 
 
 def _bytes_of(registers: Sequence[int]) -> bytes:

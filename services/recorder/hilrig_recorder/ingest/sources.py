@@ -87,6 +87,11 @@ class PublisherState:
         self.last_ns = now_ns
         return missing, stepped
 
+    @property
+    def is_streaming(self) -> bool:
+        """Whether a batch of its recording stream arrived; its events have a stream of their own."""
+        return self._next_batch > 0
+
     def next_events(self) -> LogBatch | None:
         """Remove and return the next batch of events that may be processed; None: it must wait."""
         return self.held.popleft().batch if self.held and self.held[0].batch.sequence < self._next_batch else None
@@ -129,10 +134,14 @@ class PublisherTracker:
         return publisher
 
     def last_received(self) -> dict[str, int]:
-        """Arrival of the last batch of each source, monotonic clock, ns; safe from any thread."""
+        """Arrival of the last batch of each source, monotonic clock, ns; safe from any thread.
+
+        A source is missing while only its events arrive: its states are not received yet.
+        """
         last: dict[str, int] = {}
         for publisher in list(self._publishers.values()):
-            last[publisher.name] = max(last.get(publisher.name, 0), publisher.last_ns)
+            if publisher.is_streaming:
+                last[publisher.name] = max(last.get(publisher.name, 0), publisher.last_ns)
         return last
 
     def evict_superseded(self, now_ns: int) -> list[PublisherState]:
@@ -144,7 +153,7 @@ class PublisherTracker:
         for publisher in list(self._publishers.values()):
             if now_ns - publisher.first_ns > SETTLE_TIME_NS:
                 publisher.earlier_events.clear()
-            if publisher.last_ns < min(newest_ns[publisher.name], now_ns - PUBLISHER_TIMEOUT_NS):
+            if publisher.last_ns < min(newest_ns.get(publisher.name, 0), now_ns - PUBLISHER_TIMEOUT_NS):
                 self._evict(publisher)
         evicted, self._evicted = self._evicted, []
         return evicted

@@ -242,7 +242,8 @@ def check_placement(run: Run) -> PlacementReport:
         InputError: the recording does not contain its scene.
     """
     parts = run.parts
-    last = parts[parts["step"] == parts["step"][-1]] if len(parts) else parts
+    step = parts["step"]
+    last = parts[step == step[-1]] if len(parts) else parts
     poses = [PartState(name=run.names[row["part"]], x=row["x"], y=row["y"], z=row["z"], yaw=row["yaw"]) for row in last]
     held = run.names[run.states["held_part"][-1]]
     return evaluate_placement(RigParameters.from_json(run.parameters_json).scene, poses, held=held)

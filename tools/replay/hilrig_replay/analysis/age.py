@@ -76,7 +76,8 @@ class AgeTracker:
         changed, hidden = self._changes(states)
         based = states["basis_step"] != 0
         own_ns = np.where(hidden, UNKNOWN, NO_AGE)
-        own_ns[based] = (states["sampled_ns"] - states["loop_latency_ns"])[based]
+        sampled_ns, latency_ns = states["sampled_ns"], states["loop_latency_ns"]
+        own_ns[based] = (sampled_ns - latency_ns)[based]
         # Row of the state at which the acting command took effect, from 1; 0: a state of the previous blocks.
         effect = np.maximum.accumulate(np.where(changed, np.arange(1, len(states) + 1), 0))
         basis_ns = np.concatenate(([self._basis_ns], own_ns))[effect]
@@ -231,10 +232,13 @@ class AgeTable:
         holds, last = DiskTable(_HOLD), None
         for rows in self.rows("sampled_ns", "incarnation", "age_ns", "effect_ns"):
             followed = rows if last is None else np.concatenate((last, rows))
-            aged = followed["age_ns"] > 0
-            replaced = aged[:-1] & (~aged[1:] | (np.diff(followed["effect_ns"]) != 0))
-            replaced &= (np.diff(followed["incarnation"]) == 0) & (followed["age_ns"][1:] != UNKNOWN)
-            held_ns = followed["sampled_ns"][1:] - followed["effect_ns"][:-1]
+            age_ns: NDArray[np.int64] = followed["age_ns"]
+            effect_ns: NDArray[np.int64] = followed["effect_ns"]
+            sampled_ns: NDArray[np.int64] = followed["sampled_ns"]
+            aged = age_ns > 0
+            replaced = aged[:-1] & (~aged[1:] | (np.diff(effect_ns) != 0))
+            replaced &= (np.diff(followed["incarnation"]) == 0) & (age_ns[1:] != UNKNOWN)
+            held_ns = sampled_ns[1:] - effect_ns[:-1]
             holds.add(held_ns[replaced].view(_HOLD))
             last = followed[-1:].copy()
         return holds, 0 if last is None else int(last["sampled_ns"][0] - last["effect_ns"][0])

@@ -223,7 +223,9 @@ class DataQuality:
         same = np.diff(followed["incarnation"]) == 0
         self._restarts += int((~same & self._in_session(followed[:-1])).sum())
         self._add_errors(states)
-        drift = np.abs(np.diff(followed["wall_ns"] - followed["sampled_ns"]))
+        wall_ns: NDArray[np.int64] = followed["wall_ns"]
+        sampled_ns: NDArray[np.int64] = followed["sampled_ns"]
+        drift = np.abs(np.diff(wall_ns - sampled_ns))
         self._clock_steps += int((drift[same] > WALL_CLOCK_STEP_NS).sum())
         self._gaps += _gaps(states, self._last_state)
         self._last_state = states[-1:].copy()

@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtr
 
 from hilrig_replay.io.columns import Rows, last_of_each_read
 from hilrig_sim.arm.joints import JOINT_SCALE
@@ -47,8 +48,9 @@ MAX_POLLS: Final = 3
 KNOWN_POLLS: Final = 6
 """Number of polls whose exact positions explain a torque: a law of the previous poll with a velocity over three polls
 needs five. Polls answer states at irregular distances, so a trend in time does not replace the positions."""
-MIN_GAIN_STATISTIC: Final = 25.0
-"""Squared ratio of the largest gain to its standard error from which the gains are significant."""
+MIN_GAIN_STATISTIC: Final = 20.0
+"""Squared ratio of the largest gain to its standard error from which the gains are significant: of torques without
+rounding errors, one run in 8,000 exceeds it in one of its 16 gains (normal distribution)."""
 MIN_GAIN_RATIO: Final = 0.4
 """Gain of the first poll that the torques contain, as a share of the largest gain."""
 LAW_COMMANDS: Final = 24
@@ -72,7 +74,8 @@ def follows_positions(windows: Iterable[tuple[Rows, Rows]]) -> bool:
 
 def _series(states: Rows, commands: Rows) -> Iterator[Series]:
     """The first command after each poll, with the positions of its basis, by incarnation of the simulation."""
-    commands = commands[(commands["basis_step"] > 0) & ~commands["safe"]]
+    based, safe = commands["basis_step"] > 0, commands["safe"]
+    commands = commands[based & ~safe]
     for incarnation in np.unique(states["incarnation"]):
         known = states[states["incarnation"] == incarnation]
         chosen = commands[commands["basis_incarnation"] == incarnation]
@@ -99,8 +102,8 @@ class RoundingGains:
     @property
     def noise(self) -> Floats:
         """Standard deviation of the torques that is caused by the rounding, N·m or N, (4,); 0: not significant."""
-        shown = self.statistics.max(axis=1) >= MIN_GAIN_STATISTIC
-        return np.asarray(np.where(shown, np.sqrt((self.gains**2).sum(axis=1) * ROUNDING_VARIANCE), 0.0))
+        shown = np.where(self.statistics >= MIN_GAIN_STATISTIC, self.gains, 0.0)
+        return np.asarray(np.sqrt((shown**2).sum(axis=1) * ROUNDING_VARIANCE))
 
     @property
     def polls_behind(self) -> int | None:
@@ -131,20 +134,20 @@ def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
             # A poll that returned the state of the one before can't be distinguished from it.
             fresh = np.flatnonzero(steps > 0)
             fresh = fresh[fresh >= KNOWN_POLLS - 1]
-            rows = fresh[: len(fresh) // GAIN_BLOCK_COMMANDS * GAIN_BLOCK_COMMANDS].reshape(-1, GAIN_BLOCK_COMMANDS)
-            if not len(rows):
-                continue
             error = np.rint(position) - position
             for joint in range(4):
+                # A torque at its upper or lower limit contains no errors, but those between two limited ones do.
+                used = torque[:, joint]
+                free = fresh[(used[fresh] > used.min() + 0.5) & (used[fresh] < used.max() - 0.5)]
+                rows = free[: len(free) // GAIN_BLOCK_COMMANDS * GAIN_BLOCK_COMMANDS].reshape(-1, GAIN_BLOCK_COMMANDS)
+                if not len(rows):
+                    continue
                 known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(KNOWN_POLLS)])
                 unexplained = _without(known, torque[rows, joint])
                 errors = _without(known, np.stack([error[rows - lag, joint] for lag in range(MAX_POLLS + 1)], axis=-1))
                 # The variance without the part that the errors explain, which may be most of it.
                 variance = _residual_variance(unexplained, errors, GAIN_BLOCK_COMMANDS - known.shape[2])
                 weight = np.where((unexplained**2).sum(axis=1) > 1e-6, 1 / (variance + ROUNDING_VARIANCE), 0.0)
-                # A limited torque contains no errors.
-                limited = np.abs(torque[rows, joint]) >= np.abs(torque[:, joint]).max() - 0.5
-                weight *= ~limited.any(axis=1)
                 # A joint at rest has no errors that change.
                 weight *= (errors**2).mean(axis=(1, 2)) > MIN_ERROR_VARIANCE
                 normal = np.einsum("b,bli,blj->bij", weight, errors, errors)
@@ -159,22 +162,25 @@ def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
 def _fit(blocks: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
     """Gains and their statistics of a joint, (MAX_POLLS + 1,) each, from normal matrices and right-hand sides.
 
-    The standard error is the larger one of the model and of the scatter between blocks, so that a few blocks with a
-    limited torque or a step of the set point show nothing.
+    The standard error is the larger one of the model and of the jackknife over blocks, so that a single block, or a few
+    with a limited torque or a step of the set point, show nothing.
     """
     size = MAX_POLLS + 1
     normals = np.concatenate([np.zeros((0, size, size)), *(normal for normal, _ in blocks)])
     rights = np.concatenate([np.zeros((0, size)), *(right for _, right in blocks)])
     used = np.diagonal(normals, axis1=1, axis2=2).any(axis=1)
-    if used.sum() < MIN_GAIN_BLOCKS:
+    normals, rights, count = normals[used], rights[used], int(used.sum())
+    if count < MIN_GAIN_BLOCKS:
         return np.zeros(size), np.zeros(size)
     inverse = np.linalg.pinv(normals.sum(axis=0), rcond=1e-9, hermitian=True)
     gains = inverse @ rights.sum(axis=0)
-    scores = rights[used] - normals[used] @ gains
-    count = len(scores)
-    scatter = inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
-    variances = np.maximum(np.maximum(np.diagonal(inverse), np.diagonal(scatter)), 1e-300)
-    return gains, gains**2 / variances
+    others = np.linalg.pinv(normals.sum(axis=0) - normals, rcond=1e-9, hermitian=True)
+    without_one = np.einsum("bij,bj->bi", others, rights.sum(axis=0) - rights)
+    scatter = without_one.var(axis=0) * (count - 1)
+    variances = np.maximum(np.maximum(np.diagonal(inverse), scatter), 1e-300)
+    ratios = np.abs(gains) / np.sqrt(variances)
+    # A standard error of few blocks is itself uncertain: the normal deviate that is as rare as Student's t.
+    return gains, np.minimum(ratios, -ndtri(stdtr(count - 1, -ratios))) ** 2
 
 
 def _lagged(values: NDArray[np.int64], lag: int) -> NDArray[np.int64]:

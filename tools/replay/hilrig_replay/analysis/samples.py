@@ -54,7 +54,8 @@ class CommandMatcher:
 
     def add(self, states: Rows, commands: Rows) -> NDArray[np.void]:
         """Add the next block, fields as `STATE_DTYPE` and `COMMAND_DTYPE`; returns the samples that it completes."""
-        effective = np.concatenate((self._waiting, states[states["basis_step"] != 0]))
+        based: Rows = states[states["basis_step"] != 0]
+        effective = np.concatenate((self._waiting, based))
         known = np.concatenate((self._commands, commands))
         rows, found = join_commands(effective, known)
         if len(known):

@@ -275,8 +275,10 @@ class _Resimulation:
     def _compare(self, block: _Block, plant: Plant, rigs: Ints, rows: Ints) -> int:
         """Compare the states of rigs with recorded rows; returns the first row that diverges, or the number of rows."""
         states, arm = block.states[rows], self._parameters.arm
-        off = np.abs(plant.position[:, rigs].T - states["position"])
-        off_velocity = np.abs(plant.velocity[:, rigs].T - states["velocity"])
+        position: Floats = states["position"]
+        velocity: Floats = states["velocity"]
+        off = np.abs(plant.position[:, rigs].T - position)
+        off_velocity = np.abs(plant.velocity[:, rigs].T - velocity)
         np.maximum(self._largest, off.max(axis=0), out=self._largest)
         np.maximum(self._largest_velocity, off_velocity.max(axis=0), out=self._largest_velocity)
         off_parts = self._part_deviation(block, plant, rigs, rows)
@@ -293,7 +295,8 @@ class _Resimulation:
         if states["integration_error"].any():
             self._recorded.add("integration error")
         if "integration error" in self._recorded:
-            off_error = np.abs(plant.error[:, rigs].T - states["integration_error"])
+            error: Floats = states["integration_error"]
+            off_error = np.abs(plant.error[:, rigs].T - error)
             deviations["integration error"] = (off_error, self._tolerance)
         if states["substeps"].any():
             self._recorded.add("sub-steps")
@@ -338,7 +341,8 @@ class _Resimulation:
 
     def _place(self, plant: Plant, rig: int, block: _Block, row: int) -> None:
         parts = block.parts[block.first_part[row] :][: len(self._parameters.scene.parts)]
-        poses = list(zip(*(parts[name].tolist() for name in ("x", "y", "z", "yaw")), strict=True))
+        columns = [parts[name].tolist() for name in ("x", "y", "z", "yaw")]
+        poses = list(zip(*columns, strict=True))
         state = block.states[row]
         plant.set_state(rig, state["position"], state["velocity"], poses, int(block.held[row]))
 
@@ -372,8 +376,9 @@ class _CommandCheck:
 
         States with an effort although their commands have timed out count, too.
         """
-        acting = states[(states["command_seq"] > 0) & ~states["safe"]]
-        differing = int(np.count_nonzero(states["safe"] & states["effort"].any(axis=1)))
+        commanded, safe = states["command_seq"] > 0, states["safe"]
+        acting = states[commanded & ~safe]
+        differing = int(np.count_nonzero(safe & states["effort"].any(axis=1)))
         applied = np.concatenate((self._applied, _drives(acting, acting["command_seq"])))
         # The first state of each command.
         applied = applied[np.sort(np.unique(applied["key"], return_index=True)[1])]
@@ -416,7 +421,8 @@ class _TimeCheck:
             place = np.minimum(np.searchsorted(step, basis), len(rows) - 1)
             known = step[place] == basis
             expected_ns[rows[known]] = (sampled_ns - sampled_ns[place])[known]
-            deadline_ns = sampled_ns - ticks["lateness_ns"][rows]
+            lateness_ns = ticks["lateness_ns"][rows]
+            deadline_ns = sampled_ns - lateness_ns
             periods = 1 + ticks["missed_steps"][rows][1:].astype(np.int64)
             off_grid[rows[1:]] = (np.diff(step) == 1) & (np.diff(deadline_ns) != periods * self._step_ns)
         wrong = (expected_ns >= 0) & (ticks["loop_latency_ns"] != expected_ns)

@@ -130,7 +130,8 @@ class Run:
         if configured:
             return configured
         states = next(iter(self.blocks(frozenset({"state"}), rows=1000))).states
-        first_run = states[states["incarnation"] == states["incarnation"][0]]
+        incarnations = states["incarnation"]
+        first_run = states[incarnations == incarnations[0]]
         steps = int(first_run["step"][-1]) - int(first_run["step"][0])
         if not steps:
             return _DEFAULT_STEP_NS

@@ -69,5 +69,7 @@ def _misplaced(rows: Rows) -> NDArray[np.bool_]:
     The sequence numbers of a restarted sender begin again, but at a later time.
     """
     found = np.zeros(len(rows), np.bool_)
-    found[1:] = (np.diff(rows["sequence"].astype(np.int64)) <= 0) & (np.diff(rows["wall_ns"]) <= 0)
+    sequence: NDArray[np.int64] = rows["sequence"].astype(np.int64)
+    wall_ns: NDArray[np.int64] = rows["wall_ns"]
+    found[1:] = (np.diff(sequence) <= 0) & (np.diff(wall_ns) <= 0)
     return found

@@ -159,7 +159,9 @@ def _add_moves(run: Run, parts: Rows, moved: dict[str, list[list[float]]], spaci
     if not len(parts):
         return
     time_s = run.time_s(parts)
-    poses = np.column_stack((1e3 * parts["x"], 1e3 * parts["y"], 1e3 * parts["z"], np.degrees(parts["yaw"]))).round(1)
+    x_mm, y_mm, z_mm = 1e3 * parts["x"], 1e3 * parts["y"], 1e3 * parts["z"]
+    yaw_deg = np.degrees(parts["yaw"])
+    poses = np.column_stack((x_mm, y_mm, z_mm, yaw_deg)).round(1)
     for name, rows in moved.items():
         own = np.flatnonzero(parts["part"] == run.names.code(name))
         for at, pose in zip(time_s[own].tolist(), poses[own].tolist(), strict=True):

@@ -121,11 +121,8 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     if report.loop_ms is None or report.age_ms is None:
         raise InputError(f"{run.path}: no latency to evaluate: {report.reason_text()}")
     rig = RigParameters.from_json(run.parameters_json)
-    pose = np.clip(
-        np.median(run.states["position"], axis=0),
-        rig.arm.lower + _MIN_STOP_DISTANCE,
-        rig.arm.upper - _MIN_STOP_DISTANCE,
-    )
+    median = np.median(run.states["position"], axis=0)
+    pose = np.clip(median, rig.arm.lower + _MIN_STOP_DISTANCE, rig.arm.upper - _MIN_STOP_DISTANCE)
     step_s = run.step_ns * 1e-9
     plant_model = linearize(rig.arm, pose.tolist())
     method = () if rig.sim.substeps == AUTO else (rig.sim.integrator, rig.sim.substeps)

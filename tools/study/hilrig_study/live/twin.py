@@ -83,9 +83,11 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
     answered = commands[commands["state_served_ns"] > 0]
     step_ns, own = run.step_ns, study.loop
     transport_ns = float(np.median(report.table[TRANSPORT.key])) / 2
-    after_arrival = (answered["state_served_ns"] - answered["state_arrived_ns"]) % step_ns
+    served_ns: NDArray[np.int64] = answered["state_served_ns"]
+    write_arrived_ns: NDArray[np.int64] = answered["write_arrived_ns"]
+    after_arrival = (served_ns - answered["state_arrived_ns"]) % step_ns
     phase_ms = _circular_median(after_arrival, step_ns) / 1e6 + transport_ns / 1e6
-    compute_ms = float(np.median(answered["write_arrived_ns"] - answered["state_served_ns"])) / 1e6
+    compute_ms = float(np.median(write_arrived_ns - served_ns)) / 1e6
     ticks = round(study.live_duration_s * 1e9 / step_ns)
 
     first = int(report.table["basis_step"][0])

@@ -43,7 +43,8 @@ class DeviceScan:
 
 def device_scan(commands: Rows) -> DeviceScan | None:
     """Return the scan time that the commands of a run show, fields as `COMMAND_DTYPE`; None: no echo, or too few."""
-    scans = commands[(commands["read_sent_ns"] > 0) & ~commands["basis_is_bound"]]
+    was_read, is_bound = commands["read_sent_ns"] > 0, commands["basis_is_bound"]
+    scans = commands[was_read & ~is_bound]
     if len(scans) < MIN_SCANS:
         return None
     latest_ns = scans["write_arrived_ns"]

@@ -53,7 +53,10 @@ def older_positions(windows: Iterable[Rows], gains: RoundingGains, step_ns: int)
         gains: gains of the rounding errors of the same parts.
         step_ns: step of the simulation, ns.
     """
-    parts = [_Scans.of(window[window["basis_is_bound"] & ~window["safe"]]) for window in windows]
+    parts = []
+    for window in windows:
+        is_bound, safe = window["basis_is_bound"], window["safe"]
+        parts.append(_Scans.of(window[is_bound & ~safe]))
     intervals_ns = np.concatenate([np.empty(0, np.int64), *(part.intervals_ns for part in parts)])
     if len(intervals_ns) < MIN_SCANS:
         return None
@@ -80,7 +83,8 @@ class _Scans:
 
     @classmethod
     def of(cls, commands: Rows) -> "_Scans":
-        change = np.abs(np.diff(commands["effort"], axis=0)).max(axis=1, initial=0.0)
+        effort: NDArray[np.float64] = commands["effort"]
+        change = np.abs(np.diff(effort, axis=0)).max(axis=1, initial=0.0)
         changed = np.flatnonzero(change > 0) + 1
         # Small changes are those of an arm that rests or turns: a scan may then have left the torques as they were.
         large = change[changed - 1] >= MIN_CHANGE

@@ -41,8 +41,10 @@ PIECE_S: Final = 5.0
 MIN_PIECE_ROWS: Final = 20
 """Fewer states show no oscillation; a lab's step is at most 1 s."""
 MAX_REST_SHARE: Final = 0.15
-"""Largest share of the time with less than a twentieth of the largest speed: 3 % of a sine, more of moves from pose to
-pose."""
+"""Largest share of the time with less than a twentieth of the largest speed, not on a stop: 3 % of a sine, more of
+moves from pose to pose."""
+STOP_FLAGS: Final = 0b1_0001
+"""Flags of the lower and the upper stop of joint 1; those of the next joints are shifted by one each."""
 MIN_BAND_SHARE: Final = 0.6
 """Smallest share of the variance at the frequency and its harmonics."""
 MAX_GROWTH: Final = 2.5
@@ -149,7 +151,8 @@ def limit_cycle(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Findin
             pieces += count
             for piece in np.array_split(stretch, count) if count else ():
                 speed = np.abs(piece["velocity"][:, joint])
-                if (speed <= 0.05 * speed.max()).mean() <= MAX_REST_SHARE:
+                on_stop = piece["limit_flags"] & STOP_FLAGS << joint != 0
+                if ((speed <= 0.05 * speed.max()) & ~on_stop).mean() <= MAX_REST_SHARE:
                     swing = _oscillation(piece["position"][:, joint] * JOINT_SCALE[joint], step_s, lowest_hz)
                     oscillating += [] if swing is None else [swing]
         if not oscillating or len(oscillating) < 0.5 * pieces:

@@ -16,7 +16,8 @@ def diagnose(evidence: Evidence) -> tuple[Finding, ...]:
     causes = [finding for rule in rules if (finding := rule(evidence)) is not None and is_relevant(finding)]
     explained = frozenset[str]().union(*(SUPPRESSED.get(cause.code, frozenset()) for cause in causes))
     causes = [cause for cause in causes if cause.code not in explained]
-    causes.sort(key=lambda cause: -cause.evidence["share"])
+    # Of causes that explain the same, the one of the earlier, more specific rule.
+    causes.sort(key=lambda cause: -round(cause.evidence["share"], 2))
     observations: list[Finding] = []
     for observe in OBSERVATIONS:
         observations += observe(evidence, observations)

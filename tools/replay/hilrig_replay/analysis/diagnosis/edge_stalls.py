@@ -54,12 +54,16 @@ def edge_stalls(
 
     def late_ns() -> Iterator[NDArray[np.int64]]:
         """Times of the late samples and requests, in chronological order."""
-        waits = [time_ns(rows)[rows["answered_ns"] - rows["arrived_ns"] > limit_ns] for rows in requests]
-        others = np.sort(np.concatenate([np.empty(0, np.int64), *waits]))
+        waits = [np.empty(0, np.int64)]
+        for rows in requests:
+            answered_ns, arrived_ns = rows["answered_ns"], rows["arrived_ns"]
+            waits.append(time_ns(rows)[answered_ns - arrived_ns > limit_ns])
+        others = np.sort(np.concatenate(waits))
         for rows in samples.blocks(EDGE.key, "sampled_ns", "incarnation"):
             at_ns = time_ns(rows)
             before = int(np.searchsorted(others, at_ns[-1]))
-            yield np.sort(np.concatenate((at_ns[rows[EDGE.key] > limit_ns], others[:before])))
+            late: NDArray[np.bool_] = rows[EDGE.key] > limit_ns
+            yield np.sort(np.concatenate((at_ns[late], others[:before])))
             others = others[before:]
         yield others
 

@@ -104,6 +104,12 @@ class Evidence:
         """Mean age; 0: none."""
         return 0.0 if self.age is None else self.age.age_ms.mean * MS
 
+    @property
+    def hidden_age_ns(self) -> float:
+        """Mean age that the timestamps do not show, of torques that act on an earlier poll."""
+        behind = self.gains.polls_behind
+        return float(self.gains.older_steps[behind]) * self.step_ns if behind else 0.0
+
     def cycles(self) -> Rows:
         """Cycles of the controller in the windows, fields as `CYCLE_DTYPE`."""
         found = [_cycles(window.commands) for window in self.windows]
@@ -141,9 +147,12 @@ def _cycles(commands: Rows) -> Rows:
     cycles = np.empty(max(len(last) - 1, 0), CYCLE_DTYPE)
     if not len(cycles):
         return cycles
-    cycles["held_ns"] = (last["write_received_ns"] - last["state_served_ns"])[1:]
-    cycles["pause_ns"] = last["state_served_ns"][1:] - last["write_arrived_ns"][:-1]
-    cycles["cycle_ns"] = np.diff(last["write_arrived_ns"])
+    served_ns: NDArray[np.int64] = last["state_served_ns"]
+    received_ns: NDArray[np.int64] = last["write_received_ns"]
+    arrived_ns: NDArray[np.int64] = last["write_arrived_ns"]
+    cycles["held_ns"] = (received_ns - served_ns)[1:]
+    cycles["pause_ns"] = served_ns[1:] - arrived_ns[:-1]
+    cycles["cycle_ns"] = np.diff(arrived_ns)
     same = last["session"][1:] == last["session"][:-1]
     return np.asarray(cycles[same & (cycles["cycle_ns"] > 0) & (cycles["held_ns"] >= 0)])
 
@@ -155,10 +164,13 @@ def _answers(commands: Rows) -> Rows:
     """
     if not len(commands):
         return commands
-    first = np.diff(commands["state_served_ns"], prepend=commands["state_served_ns"][:1] - 1) != 0
+    served_ns: NDArray[np.int64] = commands["state_served_ns"]
+    received_ns: NDArray[np.int64] = commands["write_received_ns"]
+    arrived_ns: NDArray[np.int64] = commands["write_arrived_ns"]
+    first = np.diff(served_ns, prepend=served_ns[:1] - 1) != 0
     begin = np.flatnonzero(first)[np.cumsum(first) - 1]
-    answered_ns = (commands["write_received_ns"] - commands["state_served_ns"])[begin]
-    apart_ns = np.diff(commands["write_arrived_ns"], prepend=commands["write_arrived_ns"][:1])
+    answered_ns = (received_ns - served_ns)[begin]
+    apart_ns = np.diff(arrived_ns, prepend=arrived_ns[:1])
     later = ~first & (apart_ns > answered_ns + NO_PAUSE_NS)
     # All writes of a read from the first later one on.
     count = np.cumsum(later)
@@ -173,7 +185,8 @@ def controlled(evidence: Evidence) -> list[Rows]:
     """
     found = []
     for states in (window.states for window in evidence.windows):
-        acts = (states["command_seq"] > 0) & ~states["safe"] & (states["session"] != 0)
+        commanded, safe, in_session = states["command_seq"] > 0, states["safe"], states["session"] != 0
+        acts = commanded & ~safe & in_session
         used = np.flatnonzero(acts & (states["effort"] != 0).any(axis=1))
         if not len(used):
             continue

@@ -44,12 +44,12 @@ phase."""
 ROUND_NS: Final = 5 * MS
 MAX_OVERSLEPT_NS: Final = 1.2 * MS
 """Largest time by which a wait is longer than requested, with the time of the requests."""
-ACK_DELAYS_NS: Final = ((39 * MS, 46 * MS), (195 * MS, 215 * MS))
-"""Ranges of TCP's delayed-acknowledgment timeout: 40 ms on Linux, 200 ms on Windows."""
+ACK_DELAYS_NS: Final = ((39 * MS, 49 * MS), (195 * MS, 215 * MS))
+"""Ranges of TCP's delayed-acknowledgment timeout: 40 ms on Linux and up to two ticks of 4 ms, 200 ms on Windows."""
 MIN_RTT_NS: Final = 1 * MS
 """Smallest round-trip time of a network that is a cause."""
-MAX_ANSWER_SHARE: Final = 0.5
-"""Mean time in which reads are answered, as a share of that between reading and writing, below which writes repeat."""
+MAX_REPEATED_SHARE: Final = 0.75
+"""Ratio of states that were read to samples below which writes repeat: of two writes of each read it is a half."""
 PAUSE_RATIO: Final = 2.5
 """Ratio to the median cycle from which a cycle is a pause."""
 RETRANSMISSION_WINDOW_NS: Final = 1.5e9
@@ -66,12 +66,11 @@ def _cause(
     text: str,
     remedy: str,
     gain_ns: float,
-    hidden_ns: float = 0.0,
     /,
     **values: float,
 ) -> Finding:
-    """A finding with the share of the age that its gain is; `hidden_ns`: age that the timestamps do not show."""
-    total_ns = evidence.mean_age_ns + hidden_ns
+    """A finding with the share of the age that its gain is, which includes the age that the timestamps do not show."""
+    total_ns = evidence.mean_age_ns + evidence.hidden_age_ns
     share = min(gain_ns / total_ns, 1.0) if total_ns > 0 else 0.0
     return Finding("timing", code, text, remedy, gain_ns / MS, {"share": share, **values})
 
@@ -96,7 +95,7 @@ def previous_poll(evidence: Evidence) -> Finding | None:
     behind = evidence.gains.polls_behind
     if not behind:
         return None
-    added_ns = float(evidence.gains.older_steps[behind]) * evidence.step_ns
+    added_ns = evidence.hidden_age_ns
     polls = "the previous poll" if behind == 1 else f"the poll {behind} polls before"
     cycle_ns = _median(evidence.cycles()["cycle_ns"])
     periods = "one period" if behind == 1 else f"{behind} periods"
@@ -105,7 +104,6 @@ def previous_poll(evidence: Evidence) -> Finding | None:
         "previous_poll",
         f"the torques act on {polls}: add {periods} of {cycle_ns / MS:.0f} ms to the measured latency",
         "write the torques that are computed from the positions just read",
-        added_ns,
         added_ns,
         polls=float(behind),
         period_ms=cycle_ns / MS,
@@ -120,7 +118,8 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
         return None
     for low, high in ACK_DELAYS_NS:
         # Each request of a program waits; a program that itself waits does so between two certain requests.
-        shares = [float(((cycles[name] > low) & (cycles[name] < high)).mean()) for name in ("held_ns", "pause_ns")]
+        waits_ns = [cycles[name] - evidence.min_rtt_ns for name in ("held_ns", "pause_ns")]
+        shares = [float(((wait_ns > low) & (wait_ns < high)).mean()) for wait_ns in waits_ns]
         if min(shares) < 0.5:
             continue
         wait_ns = float(np.median(cycles["held_ns"]))
@@ -220,18 +219,15 @@ def _computing_ns(evidence: Evidence, rows: Rows) -> Floats:
     return np.where(spent_ns > MIN_DELAY_NS, spent_ns - PROGRAM_NS, 0.0)
 
 
-def _writes_without_reading(evidence: Evidence, cycles: Rows) -> bool:
-    """Whether the torques are older than the time in which a read is answered: most writes follow no read."""
-    if not len(cycles) or not len(evidence.samples):
-        return False
-    spent_ns = sum(float(values.sum()) for values in evidence.samples.column(CONTROLLER.key)()) / len(evidence.samples)
-    return bool(cycles["held_ns"].mean() < MAX_ANSWER_SHARE * spent_ns)
+def _writes_without_reading(evidence: Evidence) -> bool:
+    """Whether a program writes several times for each read."""
+    return evidence.bases < MAX_REPEATED_SHARE * len(evidence.samples)
 
 
 def computing_time(evidence: Evidence) -> Finding | None:
     """A long time between reading and writing."""
     gain_ns, cycles = evidence.saved_ns(lambda rows: _computing_ns(evidence, rows)), evidence.cycles()
-    if not gain_ns or _writes_without_reading(evidence, cycles):
+    if not gain_ns or _writes_without_reading(evidence):
         return None
     spent_ns = (cycles["held_ns"] if len(cycles) else evidence.samples[CONTROLLER.key]) - evidence.min_rtt_ns
     spent_ns = spent_ns[spent_ns > MIN_DELAY_NS]
@@ -262,7 +258,7 @@ def slow_polling(evidence: Evidence) -> Finding | None:
     # A torque is held for a cycle: on average it is half of the additional steps older.
     gain_ns = (cycle_ns - max(cycle_ns - pause_ns, step_ns)) / 2
     age = f", the mean age {evidence.mean_age_ns / MS:.0f} ms" if evidence.age else ""
-    repeats = ", and writes again without reading" if _writes_without_reading(evidence, cycles) else ""
+    repeats = ", and writes again without reading" if _writes_without_reading(evidence) else ""
     return _cause(
         evidence,
         "slow_polling",
@@ -419,8 +415,9 @@ def beating(evidence: Evidence) -> Finding | None:
     late = count = 0
     for rows in evidence.samples.blocks("loop", REGISTER_WAIT.key, TICK_WAIT.key):
         # Steps that the loop takes without waiting for the next poll and the next tick.
-        needed = np.ceil((rows["loop"] - rows[REGISTER_WAIT.key] - rows[TICK_WAIT.key]) / step_ns)
-        late += int((np.rint(rows["loop"] / step_ns) > np.maximum(needed, 1)).sum())
+        loop_ns, register_ns, tick_ns = rows["loop"], rows[REGISTER_WAIT.key], rows[TICK_WAIT.key]
+        needed = np.ceil((loop_ns - register_ns - tick_ns) / step_ns)
+        late += int((np.rint(loop_ns / step_ns) > np.maximum(needed, 1)).sum())
         count += len(rows)
     if not late:
         return None
@@ -482,17 +479,24 @@ def controller_pauses(evidence: Evidence) -> Finding | None:
 
 
 def competing_clients(evidence: Evidence) -> Finding | None:
-    """Writes that are refused because another client writes the same."""
-    refused = total = clients = 0
+    """Writes that are refused because another client writes the same.
+
+    No torque of the refused client acts, whatever its age. The cause explains the part of the run in which this occurs,
+    in whole seconds.
+    """
+    refused = total = clients = competing_s = written_s = 0
     for window in evidence.windows:
         writes = window.traffic[np.isin(window.traffic["function"], _WRITES)]
         busy = writes[writes["exception"] == SERVER_BUSY]
         refused += len(busy)
         total += len(writes)
+        competing_s += len(np.unique(busy["arrived_ns"] // 1_000_000_000))
+        written_s += len(np.unique(writes["arrived_ns"] // 1_000_000_000))
         clients = max(clients, len(np.unique(busy["controller"])))
     if refused < MIN_REFUSED_WRITES:
         return None
-    values = {"share": 0.0, "refused": float(refused), "refused_share": refused / total, "clients": float(clients)}
+    share = competing_s / written_s
+    values = {"share": share, "refused": float(refused), "refused_share": refused / total, "clients": float(clients)}
     text = f"clients compete for the rig: {refused} writes ({refused / total:.0%}) were refused, because another wrote"
     return Finding("timing", "competing_clients", text, "let one program write to the rig", None, values)
 
@@ -527,7 +531,9 @@ OF_A_POLLING_PROGRAM: Final[frozenset[Rule]] = frozenset(
     }
 )
 """Rules about a program that polls the rig; in the client role the edge itself polls."""
-RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "cpu_steal", "watchdog_gaps"})
+RARE: Final = frozenset(
+    {"retransmissions", "edge_stall", "simulation_stall", "cpu_steal", "watchdog_gaps", "competing_clients"}
+)
 SUPPRESSED: Final = {
     "open_loop": frozenset(rule.__name__ for rule in RULES[1:]),
     "delayed_acknowledgement": frozenset({"wait_before_write", "slow_polling", "computing_time", "network", "beating"}),
@@ -547,10 +553,7 @@ SUPPRESSED: Final = {
 
 def is_relevant(finding: Finding) -> bool:
     """Whether a cause explains enough of the age to be reported."""
-    share = finding.evidence["share"]
-    if finding.code == "competing_clients":
-        return True
-    return share >= (MIN_RARE_SHARE if finding.code in RARE else MIN_SHARE)
+    return finding.evidence["share"] >= (MIN_RARE_SHARE if finding.code in RARE else MIN_SHARE)
 
 
 def _per_time(evidence: Evidence, area_ns2: float) -> float:
