@@ -56,8 +56,11 @@ def test_loop_closes_again_after_each_kill(tmp_path: Path) -> None:
             assert "connection" in killed["controller_fault"]
         with device(program, port):
             assert wait_for(is_closed)["session"] == session
-            os.kill(lab.service_pid("sim"), signal.SIGKILL)
-            # The simulation is back within about a second, which a slow `hilrig lease` would miss.
+            sim = lab.service_pid("sim")
+            # A killed simulation is back before its outage is reported; a stopped one is not.
+            os.kill(sim, signal.SIGSTOP)
+            eventually(lambda: "rig1: no states since" in lab.output())
+            os.kill(sim, signal.SIGKILL)
             eventually(lambda: "rig1: states received again" in lab.output())
             assert wait_for(is_closed)["session"] == session
             edge = lab.service_pid("edge")

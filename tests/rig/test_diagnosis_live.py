@@ -177,7 +177,8 @@ def test_wait_between_read_and_write_is_found(causes: dict[str, list[Finding]]) 
 @pytest.mark.skipif(sys.platform != "linux", reason="TCP_QUICKACK is an option of Linux")
 def test_two_segments_cost_no_delay(causes: dict[str, list[Finding]]) -> None:
     # The edge acknowledges an incomplete request at once.
-    assert causes["two segments"] == []
+    # Whether its polls beat with the steps depends on its phase.
+    assert {one.code for one in causes["two segments"]} <= {"beating"}
 
 
 def test_open_loop_after_one_read_is_found(causes: dict[str, list[Finding]]) -> None:

@@ -56,9 +56,7 @@ def _command(name: str, package: str, summary: str) -> Callable[..., None]:
                 f"--instance: expected letters, digits, - and _, starting with a letter or digit, got {instance!r}"
             )
         lab = load_lab(config)
-        if name != "recorder":
-            # The recorder must start soon after a failure, and does not need the parameters.
-            _validate(lab, config)
+        _validate(lab, config)
         names = [rig.strip() for rig in rigs.split(",")] if rigs else None
         for rig, count in Counter(names).items():
             if count > 1:
